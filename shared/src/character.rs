@@ -1,0 +1,10 @@
+//! A character: the description that stands in its `.glb` under `RHYTID_face`, checked once, at load.
+//!
+//! [`schema`] is the JSON as it is written; [`Character`] is what is left after the checks and cannot hold a wrong
+//! value. Both the server and the viewers load through [`Character::from_glb`], so a file one of them takes the other takes too.
+
+mod checked;
+mod glb;
+pub mod schema;
+
+pub use checked::{Bone, Character, CharacterError, Corrective, Drive, GroupDegenerate, LandmarkWeight, Mode, Pose, ShapeDeltas, WrinkleMap};

@@ -1,0 +1,19 @@
+//! What both ends of Rhytid agree on: the messages a tracker publishes, the hello and the frame packets a viewer
+//! gets, and the description of a character with its checks. Nothing here opens a socket, reads a clock or a file.
+
+#![forbid(unsafe_code)]
+
+pub mod character;
+mod face;
+mod names;
+pub mod layout;
+pub mod limits;
+mod tracking;
+
+pub use character::{Character, CharacterError};
+pub use face::{FaceFrame, HeadPose};
+pub use names::{ARKIT_NAMES, ArkitShape, NUM_ARKIT_SHAPES, NameError, RoomName};
+pub use tracking::{PublishHello, TrackingData, TrackingFrame};
+
+/// The default character (CC0, see the file's `asset.copyright`), as `cargo xtask bake` made it.
+pub const DEFAULT_CHARACTER_GLB: &[u8] = include_bytes!("../assets/default.glb");

@@ -1,0 +1,26 @@
+//! Limits that both ends keep. Each has its reason.
+
+/// Most bones a character may evaluate: bones and coefficients must fit WebGL2's guaranteed 16 KiB uniform block.
+pub const MAX_BONES: usize = 64;
+/// Most joints in a character's skin: 3 × vec4 each in the same 16 KiB uniform block, with room for the rest.
+pub const MAX_JOINTS: usize = 128;
+/// Most reference poses: two vec4 varyings carry their influences to the fragment stage.
+pub const MAX_POSES: usize = 8;
+/// Most wrinkle zones: two RGBA masks.
+pub const MAX_ZONES: usize = 8;
+/// Most feature points in a user's own layout; more than any tracker in use gives (MediaPipe: 478).
+pub const MAX_FEATURE_POINTS: usize = 512;
+/// Most vertices of a character: WebGL2 draws of this size still hold 60 Hz on a phone.
+pub const MAX_VERTICES: usize = 400_000;
+/// Largest character file, bytes; the browser downloads it before the first picture.
+pub const MAX_CHARACTER_BYTES: usize = 64 << 20;
+/// Largest side of a character's textures, texels: what WebGL2 guarantees is 2,048, what everything in use has is 4,096.
+pub const MAX_TEXTURE_SIDE: u32 = 4096;
+/// Largest message on a publish socket, bytes: 478 points with z and confidence as JSON take 35 KB.
+pub const MAX_MESSAGE_BYTES: usize = 256 << 10;
+/// How far an evaluated point may travel from rest, metres: the range of a packet's 12-bit positions (25 µm a step).
+pub const MAX_BONE_TRAVEL: f32 = 0.0511875;
+/// How far the head may travel from its neutral place, metres.
+pub const MAX_HEAD_TRAVEL: f32 = 0.3;
+/// Reference poses that move a bone by less than this, metres, but not by nothing, are refused: noise, not a pose.
+pub const MIN_POSE_TRAVEL: f32 = 0.0002;

@@ -1,0 +1,165 @@
+//! Names that travel: rooms and ARKit's expression shapes.
+
+use std::fmt;
+
+/// A name that broke its rule.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum NameError {
+    /// Not 1 to 64 characters of `[A-Za-z0-9_-]`.
+    #[error("room name {got:?} is not 1 to 64 characters of A-Z a-z 0-9 _ -")]
+    Room {
+        /// The name as it was given, cut to 80 characters.
+        got: String,
+    },
+}
+
+/// The name of a room: 1 to 64 characters of `[A-Za-z0-9_-]`, so that it can stand in a URL, a log line and a file name.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct RoomName(String);
+
+impl RoomName {
+    /// Checks `name`.
+    pub fn new(name: &str) -> Result<Self, NameError> {
+        let is_allowed = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-';
+        if name.is_empty() || name.len() > 64 || !name.bytes().all(is_allowed) {
+            return Err(NameError::Room { got: name.chars().take(80).collect() });
+        }
+        Ok(Self(name.to_owned()))
+    }
+
+    /// The name itself.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for RoomName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// How many expression shapes ARKit names.
+pub const NUM_ARKIT_SHAPES: usize = 52;
+
+/// ARKit's expression shapes in the order of Apple's face-tracking stream. Shapes are bound by name everywhere; this
+/// order serves packets and arrays inside Rhytid. Left and right are the subject's own.
+pub const ARKIT_NAMES: [&str; NUM_ARKIT_SHAPES] = [
+    "eyeBlinkLeft",
+    "eyeLookDownLeft",
+    "eyeLookInLeft",
+    "eyeLookOutLeft",
+    "eyeLookUpLeft",
+    "eyeSquintLeft",
+    "eyeWideLeft",
+    "eyeBlinkRight",
+    "eyeLookDownRight",
+    "eyeLookInRight",
+    "eyeLookOutRight",
+    "eyeLookUpRight",
+    "eyeSquintRight",
+    "eyeWideRight",
+    "jawForward",
+    "jawLeft",
+    "jawRight",
+    "jawOpen",
+    "mouthClose",
+    "mouthFunnel",
+    "mouthPucker",
+    "mouthLeft",
+    "mouthRight",
+    "mouthSmileLeft",
+    "mouthSmileRight",
+    "mouthFrownLeft",
+    "mouthFrownRight",
+    "mouthDimpleLeft",
+    "mouthDimpleRight",
+    "mouthStretchLeft",
+    "mouthStretchRight",
+    "mouthRollLower",
+    "mouthRollUpper",
+    "mouthShrugLower",
+    "mouthShrugUpper",
+    "mouthPressLeft",
+    "mouthPressRight",
+    "mouthLowerDownLeft",
+    "mouthLowerDownRight",
+    "mouthUpperUpLeft",
+    "mouthUpperUpRight",
+    "browDownLeft",
+    "browDownRight",
+    "browInnerUp",
+    "browOuterUpLeft",
+    "browOuterUpRight",
+    "cheekPuff",
+    "cheekSquintLeft",
+    "cheekSquintRight",
+    "noseSneerLeft",
+    "noseSneerRight",
+    "tongueOut",
+];
+
+/// One of ARKit's shapes: an index into [`ARKIT_NAMES`], always in range.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct ArkitShape(u8);
+
+impl ArkitShape {
+    /// Finds a shape by name: any case, endings `Left`/`Right`, `_L`/`_R` and `_l`/`_r` alike. `None` for a name that is none.
+    pub fn from_name(name: &str) -> Option<Self> {
+        let (stem, side) = match name.len().checked_sub(2).and_then(|at| name.split_at_checked(at)) {
+            Some((stem, "_L" | "_l")) => (stem, "left"),
+            Some((stem, "_R" | "_r")) => (stem, "right"),
+            _ => (name, ""),
+        };
+        ARKIT_NAMES
+            .iter()
+            .position(|known| {
+                known.len() == stem.len() + side.len()
+                    && known[..stem.len()].eq_ignore_ascii_case(stem)
+                    && known[stem.len()..].eq_ignore_ascii_case(side)
+            })
+            .map(|index| Self(index as u8))
+    }
+
+    /// The shape at `index` of [`ARKIT_NAMES`], if there is one.
+    pub fn from_index(index: usize) -> Option<Self> {
+        (index < NUM_ARKIT_SHAPES).then_some(Self(index as u8))
+    }
+
+    /// Index into [`ARKIT_NAMES`].
+    pub fn index(self) -> usize {
+        usize::from(self.0)
+    }
+
+    /// Apple's camelCase name.
+    pub fn name(self) -> &'static str {
+        ARKIT_NAMES[self.index()]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_are_found_under_every_spelling() {
+        for (name, want) in [("jawOpen", "jawOpen"), ("JawOpen", "jawOpen"), ("eyeBlink_L", "eyeBlinkLeft"), ("MouthSmileRight", "mouthSmileRight")] {
+            assert_eq!(ArkitShape::from_name(name).map(ArkitShape::name), Some(want), "{name}");
+        }
+        for name in ["", "_neutral", "jaw", "_L", "é_L", "jawOpen_L"] {
+            assert_eq!(ArkitShape::from_name(name), None, "{name}");
+        }
+    }
+
+    #[test]
+    fn room_names_keep_their_rule() {
+        let longest = "a".repeat(64);
+        for good in ["demo", "a", "A-b_9", longest.as_str()] {
+            assert_eq!(RoomName::new(good).expect("allowed").as_str(), good);
+        }
+        let too_long = "a".repeat(65);
+        for bad in ["", "a b", "../x", "ü", too_long.as_str()] {
+            assert!(RoomName::new(bad).is_err(), "{bad}");
+        }
+    }
+}

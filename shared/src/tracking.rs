@@ -1,0 +1,60 @@
+//! What a tracker publishes, once it has been read and checked.
+
+use crate::face::HeadPose;
+use crate::layout::Layout;
+use crate::names::NUM_ARKIT_SHAPES;
+use glam::Vec3;
+
+/// A publisher's first message, checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PublishHello {
+    /// What the sender calls itself; at most 128 characters.
+    pub source: String,
+    /// Frames a second the sender means to send, where it says so.
+    pub fps: Option<f32>,
+    /// Layout of landmark frames; `None` for a sender of weights or bones only.
+    pub layout: Option<Layout>,
+    /// Width and height of the tracker's picture, pixels; required with a layout.
+    pub image: Option<[f32; 2]>,
+    /// Focal length of the tracker's camera, pixels; the image width serves where it is unknown.
+    pub focal: Option<f32>,
+    /// Take the room over from another publisher.
+    pub takeover: bool,
+}
+
+/// One checked frame from a tracker. The buffers are reused from frame to frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrackingFrame {
+    /// Seconds on the sender's clock, strictly increasing within a session.
+    pub t: f64,
+    /// What the tracker saw.
+    pub data: TrackingData,
+}
+
+/// What a tracker saw in one frame.
+#[derive(Debug, Clone, PartialEq)]
+pub enum TrackingData {
+    /// Feature points in the order of the session's layout.
+    Landmarks {
+        /// Pixels, origin top left, y down; z in the unit of x, smaller is nearer, 0 where the tracker gives none.
+        points: Vec<[f32; 3]>,
+        /// One confidence in `[0, 1]` a point, or empty.
+        confidence: Vec<f32>,
+    },
+    /// Expression weights, clamped to `[0, 1.2]`, in the order of [`crate::ARKIT_NAMES`]; shapes not named are 0.
+    Weights {
+        /// The weights.
+        weights: Box<[f32; NUM_ARKIT_SHAPES]>,
+        /// Head pose where the tracker gives one.
+        head: Option<HeadPose>,
+    },
+    /// Bones placed directly, by an animator's rig or a clip.
+    Bones {
+        /// `(bone index, evaluated point)`, metres, head space; bones not named stay at rest.
+        points: Vec<(usize, Vec3)>,
+        /// Head pose where the sender gives one.
+        head: Option<HeadPose>,
+    },
+    /// The tracker sees no face.
+    NoFace,
+}
