@@ -1,1 +1,59 @@
-fn main() {}
+//! Developer commands: `cargo xtask demo | test | setup | bake`.
+
+mod bake;
+mod demo;
+mod setup;
+
+use anyhow::{Context, Result, ensure};
+use clap::{Parser, Subcommand};
+use std::path::PathBuf;
+use std::process::Command;
+
+#[derive(Parser)]
+#[command(about = "Rhytid's developer commands")]
+struct Arguments {
+    #[command(subcommand)]
+    command: Task,
+}
+
+#[derive(Subcommand)]
+enum Task {
+    /// Set up, build, and show the main job: a recorded tracker session drives a wrinkled face, live
+    Demo,
+    /// Set up and run every test
+    Test {
+        /// Passed on to `cargo test`
+        #[arg(trailing_var_arg = true)]
+        arguments: Vec<String>,
+    },
+    /// Find out what this machine lacks and install it where that is possible (`RHYTID_NO_INSTALL=1` forbids it)
+    Setup,
+    /// Make the default character, shared/assets/default.glb, from its CC0 sources
+    Bake,
+}
+
+fn main() -> Result<()> {
+    match Arguments::parse().command {
+        Task::Demo => demo::run(),
+        Task::Test { arguments } => test(&arguments),
+        Task::Setup => setup::run(),
+        Task::Bake => bake::run(),
+    }
+}
+
+fn test(arguments: &[String]) -> Result<()> {
+    setup::run()?;
+    let status = Command::new(env!("CARGO"))
+        .current_dir(workspace_root())
+        .args(["test", "--workspace"])
+        .args(arguments)
+        .status()
+        .context("cannot run cargo")?;
+    ensure!(status.success(), "tests failed ({status})");
+    Ok(())
+}
+
+/// The project's folder.
+fn workspace_root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask stands inside the workspace").to_owned()
+}

@@ -1,0 +1,119 @@
+//! Finds out what this machine lacks, installs it where that is possible and allowed, and says what stays missing.
+
+use anyhow::Result;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+/// Something outside Cargo that Rhytid uses.
+struct Need {
+    /// What it is for, as people would say it.
+    what: &'static str,
+    /// Debian's packages that bring it.
+    packages: &'static [&'static str],
+    /// Is it here?
+    is_here: fn() -> bool,
+    /// What goes without it.
+    without: &'static str,
+}
+
+const NEEDS: [Need; 3] = [
+    Need {
+        what: "a Vulkan driver",
+        packages: &["libvulkan1", "mesa-vulkan-drivers"],
+        is_here: has_vulkan,
+        without: "nothing can be drawn; the server and its tests work",
+    },
+    Need {
+        what: "X11 client libraries for the window",
+        packages: &["libxkbcommon-x11-0", "libxcursor1", "libxi6", "libxrandr2", "libx11-xcb1"],
+        is_here: has_x11_libraries,
+        without: "no window opens under X11; rendering to files works",
+    },
+    Need {
+        what: "Xvfb, a display for the window's test",
+        packages: &["xvfb", "xauth"],
+        is_here: || is_on_path("Xvfb") && is_on_path("xvfb-run"),
+        without: "the window's test shows as ignored",
+    },
+];
+
+/// Checks everything and installs what it may. Says what it did; a machine that stays without something is no error.
+pub fn run() -> Result<()> {
+    if !cfg!(target_os = "linux") {
+        println!("set-up: nothing to install on this system; the graphics driver and the display are its own");
+        return Ok(());
+    }
+    let missing: Vec<&Need> = NEEDS.iter().filter(|need| !(need.is_here)()).collect();
+    if missing.is_empty() {
+        println!("set-up: everything is here");
+        return Ok(());
+    }
+    let packages: Vec<&str> = missing.iter().flat_map(|need| need.packages.iter().copied()).collect();
+    for need in &missing {
+        println!("set-up: {} is missing", need.what);
+    }
+    let is_allowed = std::env::var_os("RHYTID_NO_INSTALL").is_none_or(|value| value != "1");
+    if is_allowed && is_root() && is_on_path("apt-get") {
+        if let Err(error) = install(&packages) {
+            println!("set-up: {error}");
+        }
+    }
+    for need in missing.iter().filter(|need| !(need.is_here)()) {
+        println!("set-up: still without {}: {}.", need.what, need.without);
+        println!("        To get it: sudo apt-get install --no-install-recommends {}", need.packages.join(" "));
+    }
+    Ok(())
+}
+
+/// A display a window can open on.
+pub fn has_display() -> bool {
+    let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+    !cfg!(target_os = "linux") || is_set("WAYLAND_DISPLAY") || is_set("DISPLAY")
+}
+
+fn install(packages: &[&str]) -> Result<()> {
+    // Another apt may be at work on a machine that has just been started: wait for it rather than fail.
+    const LOCK: &str = "DPkg::Lock::Timeout=300";
+    println!("set-up: installing {} (apt-get)", packages.join(" "));
+    for arguments in [vec!["update", "-q"], [vec!["install", "-y", "-q", "--no-install-recommends"], packages.to_vec()].concat()] {
+        let status = Command::new("apt-get")
+            .args(["-o", LOCK])
+            .args(&arguments)
+            .env("DEBIAN_FRONTEND", "noninteractive")
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .status()?;
+        anyhow::ensure!(status.success(), "apt-get {} failed ({status})", arguments[0]);
+    }
+    Ok(())
+}
+
+fn is_root() -> bool {
+    Command::new("id").arg("-u").output().is_ok_and(|output| output.stdout.trim_ascii() == b"0")
+}
+
+fn is_on_path(program: &str) -> bool {
+    let Some(path) = std::env::var_os("PATH") else { return false };
+    std::env::split_paths(&path).any(|folder| folder.join(program).is_file())
+}
+
+fn has_vulkan() -> bool {
+    let has_driver = std::env::var_os("VK_ICD_FILENAMES").is_some()
+        || std::env::var_os("VK_DRIVER_FILES").is_some()
+        || ["/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d"]
+            .iter()
+            .any(|folder| Path::new(folder).read_dir().is_ok_and(|mut entries| entries.next().is_some()));
+    has_driver && has_library("libvulkan.so.1")
+}
+
+fn has_x11_libraries() -> bool {
+    ["libxkbcommon-x11.so.0", "libXcursor.so.1", "libXi.so.6", "libXrandr.so.2", "libX11-xcb.so.1"].into_iter().all(has_library)
+}
+
+fn has_library(name: &str) -> bool {
+    // ldconfig stands in /sbin, which is not on everybody's path.
+    ["ldconfig", "/sbin/ldconfig", "/usr/sbin/ldconfig"]
+        .iter()
+        .find_map(|program| Command::new(program).arg("-p").output().ok())
+        .is_some_and(|output| String::from_utf8_lossy(&output.stdout).lines().any(|line| line.trim_start().starts_with(name)))
+}
