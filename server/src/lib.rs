@@ -1,1 +1,3 @@
-//! placeholder
+//! Takes what trackers see, moves a character's bones with it and streams the solved frames to viewers.
+
+pub mod feed;

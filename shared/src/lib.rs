@@ -8,12 +8,14 @@ mod face;
 mod names;
 pub mod layout;
 pub mod limits;
+pub mod packet;
 mod tracking;
+pub mod view;
 
 pub use character::{Character, CharacterError};
 pub use face::{FaceFrame, HeadPose};
 pub use names::{ARKIT_NAMES, ArkitShape, NUM_ARKIT_SHAPES, NameError, RoomName};
-pub use tracking::{PublishHello, TrackingData, TrackingFrame};
+pub use tracking::{MessageError, PublishHello, PublishMessage, PublishReader, TrackingData, TrackingFrame};
 
 /// The default character (CC0, see the file's `asset.copyright`), as `cargo xtask bake` made it.
 pub const DEFAULT_CHARACTER_GLB: &[u8] = include_bytes!("../assets/default.glb");

@@ -58,3 +58,46 @@ pub enum TrackingData {
     /// The tracker sees no face.
     NoFace,
 }
+
+impl Default for TrackingFrame {
+    fn default() -> Self {
+        Self { t: 0.0, data: TrackingData::NoFace }
+    }
+}
+
+/// What a publish message was, once it has been read.
+#[derive(Debug, Clone, PartialEq)]
+pub enum PublishMessage {
+    /// The session's first message.
+    Hello(PublishHello),
+    /// A frame; it stands in the [`TrackingFrame`] given to [`PublishReader::read`].
+    Frame,
+    /// Take the neutral face now.
+    Calibrate,
+}
+
+/// Why a publish message was refused. `message` names the field and what was expected.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{message}")]
+pub struct MessageError {
+    /// Short and stable, for programs.
+    pub code: &'static str,
+    /// For people.
+    pub message: String,
+}
+
+/// Reads the text messages of one publish session, or the lines of a feed file, without building a tree of JSON.
+#[derive(Debug, Clone)]
+pub struct PublishReader {}
+
+impl PublishReader {
+    /// A reader for a session that drives `character`, whose names `bones` and named layouts must use.
+    pub fn new(_character: &crate::Character) -> Self {
+        unimplemented!()
+    }
+
+    /// Reads one message. A frame is written into `frame`, whose buffers are reused; after an error its content is unspecified.
+    pub fn read(&mut self, _text: &str, _frame: &mut TrackingFrame) -> Result<PublishMessage, MessageError> {
+        unimplemented!()
+    }
+}
