@@ -1,0 +1,187 @@
+//! A character as the renderer needs it, decoded from its `.glb` on the CPU: triangles with skinning and weight
+//! gradients, joints, materials, wrinkle maps. No GPU here.
+
+mod gradients;
+mod joints;
+mod load;
+mod mips;
+
+pub use gradients::{triangle_gradient, weight_gradients};
+pub use joints::{JointMotion, Palette};
+pub use mips::{MipChain, Texels};
+
+use rhytid_shared::{Character, CharacterError};
+use std::sync::Arc;
+
+/// Why a character cannot be drawn.
+#[derive(Debug, thiserror::Error)]
+pub enum AssetError {
+    /// The file or its description is wrong.
+    #[error(transparent)]
+    Character(#[from] CharacterError),
+    /// An image inside the file cannot be decoded.
+    #[error("character file images[{index}]: {source}")]
+    Image {
+        /// Index into glTF `images`.
+        index: usize,
+        /// What the decoder said.
+        source: image::ImageError,
+    },
+    /// A primitive is not made of triangles.
+    #[error("character file meshes[{mesh}].primitives[{primitive}] is made of {mode:?}, expected triangles")]
+    NotTriangles {
+        /// Mesh index.
+        mesh: usize,
+        /// Primitive index within the mesh.
+        primitive: usize,
+        /// What it is made of.
+        mode: gltf::mesh::Mode,
+    },
+}
+
+/// A character ready to be uploaded.
+#[derive(Debug)]
+pub struct CharacterAsset {
+    /// Its checked description.
+    pub character: Arc<Character>,
+    /// Parts, each with one material, in the file's order.
+    pub primitives: Vec<PrimitiveAsset>,
+    /// How each joint of the palette moves; entry `i` below the number of bones is bone `i`'s joint.
+    pub palette: Palette,
+    /// The wrinkle maps, if any pose has one.
+    pub wrinkles: Option<WrinkleMaps>,
+}
+
+impl CharacterAsset {
+    /// Decodes and checks a whole `.glb`.
+    pub fn from_glb(bytes: &[u8]) -> Result<Self, AssetError> {
+        load::load(bytes)
+    }
+
+    /// Vertices of all parts.
+    pub fn num_vertices(&self) -> usize {
+        self.primitives.iter().map(|primitive| primitive.vertices.len()).sum()
+    }
+}
+
+/// One part of the character.
+#[derive(Debug)]
+pub struct PrimitiveAsset {
+    /// The material's name in the file.
+    pub name: String,
+    /// What it is made of.
+    pub surface: Surface,
+    /// Vertices, indices below point into them.
+    pub vertices: Vec<Vertex>,
+    /// Triangles, counter-clockwise from outside.
+    pub indices: Vec<u32>,
+    /// Colours and maps.
+    pub material: MaterialAsset,
+}
+
+/// What a part is made of; decides how it is shaded. Read from the material's name (see [`Surface::from_material_name`]).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Surface {
+    /// Skin: wrinkles, soft terminator, two-lobe highlight.
+    Skin,
+    /// Eyeball with its iris: wet and sharp.
+    Eye,
+    /// A clear shell over the eye or a line of tears: highlights only.
+    Wet,
+    /// Teeth, gums, tongue, the mouth's lining: moist, darker the deeper they lie.
+    Mouth,
+    /// Brows, lashes, hair of the head.
+    Hair,
+    /// Clothes and everything else.
+    Cloth,
+}
+
+impl Surface {
+    /// The surface a material's name stands for: the first of these words it contains, case ignored; skin where none.
+    pub fn from_material_name(name: &str) -> Self {
+        const WORDS: [(&str, Surface); 16] = [
+            ("brow", Surface::Hair),
+            ("lash", Surface::Hair),
+            ("hair", Surface::Hair),
+            ("cornea", Surface::Wet),
+            ("tear", Surface::Wet),
+            ("wet", Surface::Wet),
+            ("teeth", Surface::Mouth),
+            ("tooth", Surface::Mouth),
+            ("gum", Surface::Mouth),
+            ("tongue", Surface::Mouth),
+            ("mouth", Surface::Mouth),
+            ("cloth", Surface::Cloth),
+            ("shirt", Surface::Cloth),
+            ("collar", Surface::Cloth),
+            ("eye", Surface::Eye),
+            ("skin", Surface::Skin),
+        ];
+        let name = name.to_lowercase();
+        WORDS.iter().find(|(word, _)| name.contains(word)).map_or(Self::Skin, |&(_, surface)| surface)
+    }
+}
+
+/// A vertex as it is uploaded. Head space at rest, metres.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Vertex {
+    /// Position.
+    pub position: [f32; 3],
+    /// Unit normal.
+    pub normal: [f32; 3],
+    /// Unit tangent along +U; w is the bitangent's sign.
+    pub tangent: [f32; 4],
+    /// Texture coordinates, origin top left.
+    pub uv: [f32; 2],
+    /// Palette entries.
+    pub joints: [u8; 4],
+    /// Weights of the entries, sum 1.
+    pub weights: [f32; 4],
+    /// Gradients of weights 1, 2 and 3 in the tangent plane, 1/metre, each along the tangent and along
+    /// `cross(normal, tangent)`. Weight 0's gradient is minus their sum.
+    pub gradients: [[f32; 2]; 3],
+}
+
+/// Colours and maps of a part.
+#[derive(Debug)]
+pub struct MaterialAsset {
+    /// Multiplies the albedo map; linear RGB and alpha.
+    pub base_color: [f32; 4],
+    /// Albedo, sRGB-encoded RGB and linear alpha.
+    pub albedo: Option<MipChain>,
+    /// Partial derivatives of the pores and creases at rest: `(code - 128) / 127 * normal_scale` in red and green.
+    pub normal: Option<MipChain>,
+    /// Largest slope the codes of `normal` reach.
+    pub normal_scale: f32,
+    /// Ambient occlusion in red, roughness in green, both linear and 1 where a map is missing.
+    pub surface_map: Option<MipChain>,
+    /// Multiplies the roughness of the map.
+    pub roughness: f32,
+    /// How much of the occlusion map is applied, 0 to 1.
+    pub occlusion_strength: f32,
+    /// What alpha does.
+    pub alpha: Alpha,
+    /// Both sides are drawn.
+    pub is_double_sided: bool,
+}
+
+/// What a material's alpha does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Alpha {
+    /// Nothing.
+    Opaque,
+    /// It becomes coverage of the samples of a pixel.
+    Coverage,
+}
+
+/// All wrinkle maps of a character, one layer a pose.
+#[derive(Debug)]
+pub struct WrinkleMaps {
+    /// `o` layers of red and green codes; poses without a map have a layer of code 128.
+    pub layers: Vec<MipChain>,
+    /// `o` scales: largest slope the codes of a layer reach; 0 where a pose has no map.
+    pub scales: Vec<f32>,
+    /// Whether a layer also contains the pores of the neutral map.
+    pub contains_neutral: Vec<bool>,
+}

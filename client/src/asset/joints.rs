@@ -1,0 +1,71 @@
+//! From a drawn frame to one matrix a joint.
+
+use crate::renderer::RenderFrame;
+use glam::{Affine3A, Quat, Vec3};
+use rhytid_shared::Character;
+use rhytid_shared::limits::{MAX_BONES, MAX_JOINTS};
+
+/// How a joint moves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum JointMotion {
+    /// Not at all: it lies outside the head's part of the skeleton.
+    Still,
+    /// With the head.
+    Head,
+    /// With a bone; joints below a bone that are none themselves move with it, too.
+    Bone {
+        /// Index into [`Character::bones`].
+        bone: usize,
+        /// Whether the joint lies below the head joint and so is carried by it.
+        follows_head: bool,
+    },
+}
+
+/// The joints that vertices refer to. Entry `i` below the number of bones belongs to bone `i`, so that a vertex's joint
+/// number is also the number of its bone's coefficients; the skin's other joints follow.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Palette {
+    /// One motion an entry, at most [`Palette::CAPACITY`].
+    pub motions: Vec<JointMotion>,
+}
+
+impl Palette {
+    /// Most entries: every bone and, for bones that share a joint, every joint besides.
+    pub const CAPACITY: usize = MAX_BONES + MAX_JOINTS;
+
+    /// `entries` matrices that take a point of the neutral mesh to where `frame` has it, model space.
+    ///
+    /// # Panics
+    /// Where `frame` does not fit `character` ([`RenderFrame::fits`]).
+    pub fn model_from_rest(&self, character: &Character, frame: &RenderFrame) -> Vec<Affine3A> {
+        let head = model_from_head(character, frame);
+        let of_motion = |motion: &JointMotion| match *motion {
+            JointMotion::Still => Affine3A::IDENTITY,
+            JointMotion::Head => head,
+            JointMotion::Bone { bone, follows_head: true } => head * head_from_rest(character, frame, bone),
+            JointMotion::Bone { bone, follows_head: false } => head_from_rest(character, frame, bone),
+        };
+        self.motions.iter().map(of_motion).collect()
+    }
+}
+
+/// The rigid motion of the head: about its pivot, then to its place.
+fn model_from_head(character: &Character, frame: &RenderFrame) -> Affine3A {
+    about(frame.head.rotation, character.head_pivot, character.head_pivot + frame.head.position)
+}
+
+/// The motion of one bone in head space. Bones that turn do so about their pivot; all others carry their evaluated
+/// point to its place and turn about it: by the rotation of the bone they turn with, or their own.
+fn head_from_rest(character: &Character, frame: &RenderFrame, bone: usize) -> Affine3A {
+    let description = &character.bones[bone];
+    if let Some(pivot) = description.pivot() {
+        return about(frame.rotations[bone], pivot, pivot);
+    }
+    let rotation = frame.rotations[description.turns_with.unwrap_or(bone)];
+    about(rotation, description.rest, frame.points[bone])
+}
+
+/// Turns about `from` and moves `from` to `to`.
+fn about(rotation: Quat, from: Vec3, to: Vec3) -> Affine3A {
+    Affine3A::from_rotation_translation(rotation, to - rotation * from)
+}

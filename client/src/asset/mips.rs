@@ -1,0 +1,149 @@
+//! Mip chains made on the CPU, each kind of texel averaged by its meaning.
+
+use image::RgbaImage;
+
+/// What the texels of a map mean: decides how four of them become one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Texels {
+    /// sRGB-encoded RGB with linear alpha: light is averaged, weighted by alpha. 4 bytes.
+    AlbedoSrgb,
+    /// Partial derivatives in red and green: the mean of slopes is the slope of the mean surface. 2 bytes.
+    Slopes,
+    /// Linear values in red and green (occlusion, roughness). 2 bytes.
+    Linear2,
+}
+
+impl Texels {
+    /// Bytes a texel.
+    pub fn size(self) -> usize {
+        match self {
+            Self::AlbedoSrgb => 4,
+            Self::Slopes | Self::Linear2 => 2,
+        }
+    }
+}
+
+/// A map with all its smaller versions down to 1 × 1.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MipChain {
+    /// Width and height of the largest.
+    pub size: [u32; 2],
+    /// What a texel means.
+    pub texels: Texels,
+    /// Levels, the largest first, rows tightly packed.
+    pub levels: Vec<Vec<u8>>,
+}
+
+impl MipChain {
+    /// The chain of a picture; kinds of two bytes take its red and green.
+    pub fn new(image: &RgbaImage, texels: Texels) -> Self {
+        let base = match texels {
+            Texels::AlbedoSrgb => image.as_raw().clone(),
+            Texels::Slopes | Texels::Linear2 => image.as_raw().as_chunks::<4>().0.iter().flat_map(|&[r, g, _, _]| [r, g]).collect(),
+        };
+        Self::from_texels([image.width(), image.height()], texels, base)
+    }
+
+    /// The chain of texels already in their layout; `base` holds `width * height * texels.size()` bytes.
+    pub fn from_texels(size: [u32; 2], texels: Texels, base: Vec<u8>) -> Self {
+        let mut levels = vec![base];
+        let mut of = size;
+        while of != [1, 1] {
+            let next = [(of[0] / 2).max(1), (of[1] / 2).max(1)];
+            let level = halve(&levels[levels.len() - 1], of, next, texels);
+            levels.push(level);
+            of = next;
+        }
+        Self { size, texels, levels }
+    }
+
+    /// One colour everywhere.
+    pub fn uniform(size: [u32; 2], texels: Texels, texel: &[u8]) -> Self {
+        Self::from_texels(size, texels, texel.repeat((size[0] * size[1]) as usize))
+    }
+
+    /// Bytes of all levels.
+    pub fn num_bytes(&self) -> usize {
+        self.levels.iter().map(Vec::len).sum()
+    }
+}
+
+fn halve(from: &[u8], [width, height]: [u32; 2], [to_width, to_height]: [u32; 2], texels: Texels) -> Vec<u8> {
+    let size = texels.size();
+    let mut to = Vec::with_capacity(to_width as usize * to_height as usize * size);
+    let linear = linear_from_srgb_table();
+    for y in 0..to_height {
+        for x in 0..to_width {
+            let texel = |dx: u32, dy: u32| {
+                let at = ((2 * y + dy).min(height - 1) * width + (2 * x + dx).min(width - 1)) as usize * size;
+                &from[at..at + size]
+            };
+            let four = [texel(0, 0), texel(1, 0), texel(0, 1), texel(1, 1)];
+            match texels {
+                Texels::Slopes | Texels::Linear2 => {
+                    for channel in 0..2 {
+                        let sum: u32 = four.iter().map(|texel| u32::from(texel[channel])).sum();
+                        to.push(((sum + 2) / 4) as u8);
+                    }
+                }
+                Texels::AlbedoSrgb => {
+                    let alpha: f32 = four.iter().map(|texel| f32::from(texel[3])).sum();
+                    for channel in 0..3 {
+                        let light = |texel: &&[u8]| linear[usize::from(texel[channel])];
+                        let mean = if alpha > 0.0 {
+                            four.iter().map(|texel| light(texel) * f32::from(texel[3])).sum::<f32>() / alpha
+                        } else {
+                            four.iter().map(light).sum::<f32>() / 4.0
+                        };
+                        to.push(srgb_from_linear(mean));
+                    }
+                    to.push((alpha / 4.0 + 0.5) as u8);
+                }
+            }
+        }
+    }
+    to
+}
+
+fn linear_from_srgb_table() -> [f32; 256] {
+    std::array::from_fn(|code| {
+        let encoded = code as f32 / 255.0;
+        if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+    })
+}
+
+fn srgb_from_linear(linear: f32) -> u8 {
+    let encoded = if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
+    (encoded * 255.0 + 0.5) as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chain_ends_at_one_texel_and_keeps_flat_slopes_flat() {
+        let chain = MipChain::uniform([8, 2], Texels::Slopes, &[128, 128]);
+        assert_eq!(chain.levels.iter().map(Vec::len).collect::<Vec<_>>(), [32, 8, 4, 2]);
+        assert!(chain.levels.iter().flatten().all(|&code| code == 128));
+    }
+
+    #[test]
+    fn slopes_average_as_slopes() {
+        // Two opposite slopes side by side are a flat surface from afar.
+        let chain = MipChain::from_texels([2, 1], Texels::Slopes, vec![128 + 100, 128, 128 - 100, 128 + 40]);
+        assert_eq!(chain.levels[1], [128, 148]);
+    }
+
+    #[test]
+    fn albedo_averages_light_not_codes() {
+        let chain = MipChain::from_texels([2, 1], Texels::AlbedoSrgb, vec![0, 0, 0, 255, 255, 255, 255, 255]);
+        assert_eq!(chain.levels[1], [188, 188, 188, 255]);
+    }
+
+    #[test]
+    fn clear_texels_do_not_stain_their_neighbours() {
+        let chain = MipChain::from_texels([2, 1], Texels::AlbedoSrgb, vec![255, 0, 255, 0, 40, 30, 20, 255]);
+        assert_eq!(chain.levels[1], [40, 30, 20, 128]);
+    }
+}

@@ -1,0 +1,101 @@
+//! Where the picture is taken from.
+
+use glam::camera::rh::{proj, view};
+use glam::{Mat4, Quat, Vec3};
+use rhytid_shared::Character;
+
+/// An orbiting perspective camera. World space is the character's model space (metres, +Y up, +Z out of the face).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    /// Point looked at, metres.
+    pub target: Vec3,
+    /// Turn about +Y, radians; positive moves the camera to +X, the character's left.
+    pub yaw: f32,
+    /// Turn upwards, radians; positive looks down on the face.
+    pub pitch: f32,
+    /// From the target to the eye, metres.
+    pub distance: f32,
+    /// Vertical field of view, radians.
+    pub fovy: f32,
+}
+
+/// Steepest pitch: the view matrix degenerates at a right angle.
+const MAX_PITCH: f32 = 1.5;
+/// Nearest and farthest the eye may come, metres.
+const DISTANCE_RANGE: [f32; 2] = [0.15, 4.0];
+/// Clip planes, metres: nothing of a bust is nearer or farther than that.
+const NEAR: f32 = 0.05;
+const FAR: f32 = 6.0;
+/// A portrait lens: 85 mm on 36 × 24 mm film, upright, sees 24°.
+const PORTRAIT_FOVY: f32 = 0.42;
+/// Height of the picture in units of brow to chin: the whole head and the top of the shoulders, the face large enough for
+/// a face tracker. Tuned by eye.
+const PICTURE_HEIGHT_IN_FACES: f32 = 2.75;
+
+impl Camera {
+    /// From the front on the neutral head: the face in the middle, room above it, a hint of shoulders.
+    pub fn front(character: &Character) -> Self {
+        let marks = &character.ibug68;
+        let chin = marks[8];
+        let brows = (marks[19] + marks[24]) * 0.5;
+        let face_height = (brows.y - chin.y).max(0.01);
+        let target = Vec3::new(0.5 * (marks[36].x + marks[45].x), chin.y + 0.62 * face_height, character.head_pivot.z);
+        let height = PICTURE_HEIGHT_IN_FACES * face_height;
+        let depth_of_face = brows.z - target.z;
+        Self { target, yaw: 0.0, pitch: 0.0, distance: depth_of_face + 0.5 * height / (0.5 * PORTRAIT_FOVY).tan(), fovy: PORTRAIT_FOVY }
+    }
+
+    /// Turned about the target, radians; the pitch stops short of the poles.
+    pub fn orbit(&mut self, delta_yaw: f32, delta_pitch: f32) {
+        self.yaw = (self.yaw + delta_yaw).rem_euclid(std::f32::consts::TAU);
+        self.pitch = (self.pitch + delta_pitch).clamp(-MAX_PITCH, MAX_PITCH);
+    }
+
+    /// Brought nearer (`factor` < 1) or farther.
+    pub fn zoom(&mut self, factor: f32) {
+        self.distance = (self.distance * factor).clamp(DISTANCE_RANGE[0], DISTANCE_RANGE[1]);
+    }
+
+    /// Where the camera stands, world space.
+    pub fn eye(&self) -> Vec3 {
+        self.target + Quat::from_rotation_y(self.yaw) * Quat::from_rotation_x(-self.pitch) * Vec3::Z * self.distance
+    }
+
+    /// World to clip space (depth 0 at the near plane, 1 at the far plane).
+    pub fn clip_from_world(&self, aspect: f32) -> Mat4 {
+        let view_from_world = view::look_at_mat4(self.eye(), self.target, Vec3::Y);
+        proj::directx::perspective(self.fovy, aspect, NEAR, FAR) * view_from_world
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera() -> Camera {
+        Camera { target: Vec3::new(0.0, 1.5, 0.0), yaw: 0.0, pitch: 0.0, distance: 1.0, fovy: 0.4 }
+    }
+
+    #[test]
+    fn characters_left_is_on_the_right_of_a_frontal_picture() {
+        let clip = camera().clip_from_world(1.0) * Vec3::new(0.05, 1.5, 0.0).extend(1.0);
+        assert!(clip.x / clip.w > 0.1, "{clip}");
+    }
+
+    #[test]
+    fn positive_yaw_goes_to_the_characters_left_and_positive_pitch_up() {
+        let mut camera = camera();
+        camera.orbit(0.5, 0.25);
+        let eye = camera.eye();
+        assert!(eye.x > 0.4 && eye.y > 1.7 && eye.z > 0.5, "{eye}");
+        assert!((eye.distance(camera.target) - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn orbit_never_reaches_a_pole() {
+        let mut camera = camera();
+        camera.orbit(0.0, 100.0);
+        assert!(camera.clip_from_world(1.0).is_finite());
+        assert!(camera.eye().z > 0.0);
+    }
+}

@@ -1,0 +1,111 @@
+//! What a drawing shows and how wrinkle maps are blended.
+
+use rhytid_shared::Character;
+
+/// What is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ViewMode {
+    /// The face with its wrinkles.
+    #[default]
+    Beauty,
+    /// The face without its wrinkles, by the pipeline that has no wrinkle code.
+    Bare,
+    /// How strongly reference poses show, as a heat map over a grey face: one pose by its index, or all in their own hues.
+    Influence(Option<usize>),
+    /// World-space normals after skinning and wrinkles, `n * 0.5 + 0.5`.
+    Normals,
+    /// The triangles' edges.
+    Wireframe,
+    /// Left half of the picture with wrinkles, right half without.
+    Split,
+}
+
+/// Why a view's name was refused.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("view {got:?} is unknown, expected one of: {expected}")]
+pub struct ViewError {
+    /// What was given.
+    pub got: String,
+    /// The names this character knows.
+    pub expected: String,
+}
+
+impl ViewMode {
+    /// Every view of `character`, in the order a list of them should have.
+    pub fn all(character: &Character) -> Vec<Self> {
+        let mut views = vec![Self::Beauty, Self::Bare, Self::Split, Self::Influence(None)];
+        views.extend((0..character.num_poses()).map(|k| Self::Influence(Some(k))));
+        views.extend([Self::Normals, Self::Wireframe]);
+        views
+    }
+
+    /// Reads `beauty`, `bare`, `split`, `influence`, `influence:POSE` (a pose's name), `normals` or `wireframe`.
+    pub fn parse(text: &str, character: &Character) -> Result<Self, ViewError> {
+        let all = Self::all(character);
+        all.iter().copied().find(|view| view.name(character) == text).ok_or_else(|| ViewError {
+            got: text.to_owned(),
+            expected: all.iter().map(|view| view.name(character)).collect::<Vec<_>>().join(", "),
+        })
+    }
+
+    /// The name that [`ViewMode::parse`] reads.
+    pub fn name(self, character: &Character) -> String {
+        match self {
+            Self::Beauty => "beauty".into(),
+            Self::Bare => "bare".into(),
+            Self::Influence(None) => "influence".into(),
+            Self::Influence(Some(k)) => match character.poses.get(k) {
+                Some(pose) => format!("influence:{}", pose.name),
+                None => format!("influence:{k}"),
+            },
+            Self::Normals => "normals".into(),
+            Self::Wireframe => "wireframe".into(),
+            Self::Split => "split".into(),
+        }
+    }
+}
+
+/// How a base normal and wrinkle maps become one normal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum BlendMode {
+    /// Sum of partial derivatives: `p = base + Σ Inf_k delta_k`, `n = normalize(p, 1)` (Jimenez et al. 2011, 1.2).
+    #[default]
+    PartialDerivatives,
+    /// Weighted mean of whole normals that contain the pores (Dutreve et al. 2009, 5.3, first case).
+    Simple,
+    /// The formula as Dutreve et al. 2009, 5.3, print it for maps of wrinkles alone, with the rest term it lacks.
+    Printed,
+}
+
+impl BlendMode {
+    /// All modes.
+    pub const ALL: [Self; 3] = [Self::PartialDerivatives, Self::Simple, Self::Printed];
+
+    /// The mode's name on command lines.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::PartialDerivatives => "pd",
+            Self::Simple => "simple",
+            Self::Printed => "printed",
+        }
+    }
+}
+
+impl std::fmt::Display for BlendMode {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// A blend mode's name was none of [`BlendMode::ALL`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("blend {0:?} is unknown, expected one of: pd, simple, printed")]
+pub struct BlendError(String);
+
+impl std::str::FromStr for BlendMode {
+    type Err = BlendError;
+
+    fn from_str(text: &str) -> Result<Self, BlendError> {
+        Self::ALL.into_iter().find(|mode| mode.name() == text).ok_or_else(|| BlendError(text.to_owned()))
+    }
+}
