@@ -1,8 +1,9 @@
 //! Feed files: the publish messages of one session, one a line (`.jsonl`).
 
+use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
 use std::fs::File;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, ErrorKind, Read};
 use std::path::Path;
 
 /// Why a feed could not be read.
@@ -60,13 +61,75 @@ impl Feed {
 impl<R: BufRead> Feed<R> {
     /// Reads the hello from `lines`; `path` is what errors call the feed.
     pub fn new(lines: R, path: String, character: &Character) -> Result<Self, FeedError> {
-        let _ = (&lines, &path, PublishReader::new(character));
-        unimplemented!()
+        let mut hello = PublishHello { source: String::new(), fps: None, layout: None, image: None, focal: None, takeover: false };
+        let reader = PublishReader::new(character);
+        let mut feed = Self { hello: hello.clone(), path, line: 0, text: String::new(), lines, reader };
+        if feed.next_line()? {
+            match feed.read(&mut TrackingFrame::default())? {
+                PublishMessage::Hello(first) => hello = first,
+                PublishMessage::Frame | PublishMessage::Calibrate => return Err(feed.refuse(MessageError::new("no_hello", NO_HELLO))),
+            }
+        } else {
+            feed.line = 1;
+            return Err(feed.refuse(MessageError::new("no_hello", format!("the feed is empty, {NO_HELLO}"))));
+        }
+        Ok(Self { hello, ..feed })
     }
 
     /// The next line that is not blank; `None` at the end. A frame is written into `frame`.
     pub fn next_frame(&mut self, frame: &mut TrackingFrame) -> Result<Option<FeedItem>, FeedError> {
-        let _ = (self.reader.read(&self.text, frame), self.line, &mut self.lines, &self.path, PublishMessage::Frame);
-        unimplemented!()
+        if !self.next_line()? {
+            return Ok(None);
+        }
+        match self.read(frame)? {
+            PublishMessage::Frame => Ok(Some(FeedItem::Frame)),
+            PublishMessage::Calibrate => Ok(Some(FeedItem::Calibrate)),
+            PublishMessage::Hello(_) => Err(self.refuse(MessageError::new("repeated_hello", "a feed has one hello, its first line"))),
+        }
+    }
+
+    /// The line last read, as it stands in the file.
+    pub fn text(&self) -> &str {
+        &self.text
+    }
+
+    /// Number of the line last read, from 1.
+    pub fn line(&self) -> usize {
+        self.line
+    }
+
+    fn read(&mut self, frame: &mut TrackingFrame) -> Result<PublishMessage, FeedError> {
+        self.reader.read(&self.text, frame).map_err(|source| FeedError::Line { path: self.path.clone(), line: self.line, source })
+    }
+
+    fn refuse(&self, source: MessageError) -> FeedError {
+        FeedError::Line { path: self.path.clone(), line: self.line, source }
+    }
+
+    /// Reads the next line that is not blank into `text`, without its end; false at the end of the feed.
+    fn next_line(&mut self) -> Result<bool, FeedError> {
+        loop {
+            self.text.clear();
+            self.line += 1;
+            let most = MAX_MESSAGE_BYTES as u64 + 2;
+            let read = (&mut self.lines).take(most).read_line(&mut self.text);
+            let num_bytes = match read {
+                Ok(num_bytes) => num_bytes,
+                Err(error) if error.kind() == ErrorKind::InvalidData => return Err(self.refuse(MessageError::new("malformed_json", "line is not UTF-8 text"))),
+                Err(source) => return Err(FeedError::Io { path: self.path.clone(), source }),
+            };
+            if num_bytes == 0 {
+                return Ok(false);
+            }
+            self.text.truncate(self.text.trim_end_matches(['\n', '\r']).len());
+            if self.text.len() > MAX_MESSAGE_BYTES {
+                return Err(self.refuse(MessageError::new("too_long", format!("line is longer than {MAX_MESSAGE_BYTES} bytes"))));
+            }
+            if !self.text.trim().is_empty() {
+                return Ok(true);
+            }
+        }
     }
 }
+
+const NO_HELLO: &str = "the first line must be {\"type\":\"hello\",\"version\":1,…}";

@@ -7,4 +7,6 @@ mod checked;
 mod glb;
 pub mod schema;
 
-pub use checked::{Bone, Character, CharacterError, Corrective, Drive, GroupDegenerate, LandmarkWeight, Mode, Pose, ShapeDeltas, WrinkleMap};
+pub use checked::{
+    Bone, Character, CharacterError, Corrective, Drive, GroupDegenerate, LandmarkWeight, Mode, Pose, ShapeDeltas, WrinkleMap,
+};

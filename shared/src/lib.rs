@@ -5,10 +5,12 @@
 
 pub mod character;
 mod face;
-mod names;
 pub mod layout;
 pub mod limits;
+mod names;
 pub mod packet;
+#[cfg(test)]
+mod testing;
 mod tracking;
 pub mod view;
 

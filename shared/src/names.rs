@@ -143,7 +143,9 @@ mod tests {
 
     #[test]
     fn shapes_are_found_under_every_spelling() {
-        for (name, want) in [("jawOpen", "jawOpen"), ("JawOpen", "jawOpen"), ("eyeBlink_L", "eyeBlinkLeft"), ("MouthSmileRight", "mouthSmileRight")] {
+        for (name, want) in
+            [("jawOpen", "jawOpen"), ("JawOpen", "jawOpen"), ("eyeBlink_L", "eyeBlinkLeft"), ("MouthSmileRight", "mouthSmileRight")]
+        {
             assert_eq!(ArkitShape::from_name(name).map(ArkitShape::name), Some(want), "{name}");
         }
         for name in ["", "_neutral", "jaw", "_L", "é_L", "jawOpen_L"] {

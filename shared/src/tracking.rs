@@ -1,9 +1,14 @@
-//! What a tracker publishes, once it has been read and checked.
+//! What a tracker publishes: the checked messages, and the reader that turns their JSON into them.
+
+mod fields;
+mod reader;
 
 use crate::face::HeadPose;
 use crate::layout::Layout;
 use crate::names::NUM_ARKIT_SHAPES;
 use glam::Vec3;
+
+pub use reader::PublishReader;
 
 /// A publisher's first message, checked.
 #[derive(Debug, Clone, PartialEq)]
@@ -86,18 +91,9 @@ pub struct MessageError {
     pub message: String,
 }
 
-/// Reads the text messages of one publish session, or the lines of a feed file, without building a tree of JSON.
-#[derive(Debug, Clone)]
-pub struct PublishReader {}
-
-impl PublishReader {
-    /// A reader for a session that drives `character`, whose names `bones` and named layouts must use.
-    pub fn new(_character: &crate::Character) -> Self {
-        unimplemented!()
-    }
-
-    /// Reads one message. A frame is written into `frame`, whose buffers are reused; after an error its content is unspecified.
-    pub fn read(&mut self, _text: &str, _frame: &mut TrackingFrame) -> Result<PublishMessage, MessageError> {
-        unimplemented!()
+impl MessageError {
+    /// A refusal with its code and its reason.
+    pub fn new(code: &'static str, message: impl Into<String>) -> Self {
+        Self { code, message: message.into() }
     }
 }

@@ -182,7 +182,12 @@ impl JsonFrame {
                 .collect(),
             influence: frame.influences.chunks(num_bones).map(<[f32]>::to_vec).collect(),
             zones: frame.zones.clone(),
-            shapes: frame.shapes.iter().flat_map(|weights| ARKIT_NAMES.iter().zip(weights)).map(|(name, weight)| ((*name).to_owned(), *weight)).collect(),
+            shapes: frame
+                .shapes
+                .iter()
+                .flat_map(|weights| ARKIT_NAMES.iter().zip(weights))
+                .map(|(name, weight)| ((*name).to_owned(), *weight))
+                .collect(),
             head: JsonHead { rotation: frame.head.rotation.to_array(), position: frame.head.position.to_array() },
         }
     }

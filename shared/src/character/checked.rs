@@ -216,7 +216,10 @@ impl Character {
     /// Checks the extension by itself. `head_pivot`, shapes and hash belong to the rest of the file and are given.
     pub(super) fn from_schema(face: &Face, head_pivot: Vec3, sha256: String) -> Result<Self> {
         if face.version != schema::VERSION {
-            return Err(CharacterError::field("RHYTID_face.version", format!("is {}, this program reads {}", face.version, schema::VERSION)));
+            return Err(CharacterError::field(
+                "RHYTID_face.version",
+                format!("is {}, this program reads {}", face.version, schema::VERSION),
+            ));
         }
         let ibug68 = check_landmarks(face)?;
         let bones = check_bones(&face.bones)?;
@@ -227,14 +230,20 @@ impl Character {
         }
         features.extend(bones.iter().map(|bone| (bone.name.clone(), bone.rest)));
         if features.len() > MAX_FEATURE_POINTS {
-            return Err(CharacterError::field("RHYTID_face.features", format!("has {} points, at most {MAX_FEATURE_POINTS} are allowed", features.len())));
+            return Err(CharacterError::field(
+                "RHYTID_face.features",
+                format!("has {} points, at most {MAX_FEATURE_POINTS} are allowed", features.len()),
+            ));
         }
         let groups = check_groups(&face.groups, &index_of)?;
         let poses = check_poses(&face.poses, &bones, &index_of)?;
         let correctives = check_correctives(&face.correctives, &index_of)?;
         let falloff = face.evaluation.falloff;
         if !(falloff > 0.0 && falloff <= 1.0) {
-            return Err(CharacterError::field("RHYTID_face.evaluation.falloff", format!("is {falloff}, expected more than 0 and at most 1")));
+            return Err(CharacterError::field(
+                "RHYTID_face.evaluation.falloff",
+                format!("is {falloff}, expected more than 0 and at most 1"),
+            ));
         }
         Ok(Self {
             name: face.name.chars().take(128).collect(),
@@ -261,7 +270,10 @@ const FARTHEST_POINT: f32 = 1.0;
 fn check_point(point: [f32; 3], field: impl Fn() -> String) -> Result<Vec3> {
     let point = Vec3::from(point);
     if !point.is_finite() || point.abs().max_element() > FARTHEST_POINT {
-        return Err(CharacterError::field(field(), format!("is {point}, expected finite metres within ±{FARTHEST_POINT} of the origin of head space")));
+        return Err(CharacterError::field(
+            field(),
+            format!("is {point}, expected finite metres within ±{FARTHEST_POINT} of the origin of head space"),
+        ));
     }
     Ok(point)
 }
@@ -278,10 +290,16 @@ fn check_landmarks(face: &Face) -> Result<Box<[Vec3; NUM_IBUG]>> {
     }
     let interocular = points[36].distance(points[45]);
     if !(0.03..0.3).contains(&interocular) {
-        return Err(CharacterError::field(field, format!("has its outer eye corners {interocular} m apart, expected 0.03 to 0.3 (are the units metres?)")));
+        return Err(CharacterError::field(
+            field,
+            format!("has its outer eye corners {interocular} m apart, expected 0.03 to 0.3 (are the units metres?)"),
+        ));
     }
     if points[45].x <= points[36].x {
-        return Err(CharacterError::field(field, "has the left eye (45) at smaller x than the right (36), expected +X to the character's left"));
+        return Err(CharacterError::field(
+            field,
+            "has the left eye (45) at smaller x than the right (36), expected +X to the character's left",
+        ));
     }
     Ok(points)
 }
@@ -341,7 +359,10 @@ fn check_drive(drive: &schema::Drive, field: impl Fn(&str) -> String) -> Result<
             .iter()
             .map(|&(landmark, weight)| {
                 if landmark >= NUM_IBUG {
-                    Err(CharacterError::field(field("drive.landmarks"), format!("names landmark {landmark}, expected 0 to {}", NUM_IBUG - 1)))
+                    Err(CharacterError::field(
+                        field("drive.landmarks"),
+                        format!("names landmark {landmark}, expected 0 to {}", NUM_IBUG - 1),
+                    ))
                 } else if !(weight.abs() > 0.0 && weight.abs() <= 2.0) {
                     Err(CharacterError::field(field("drive.landmarks"), format!("has weight {weight}, expected within ±2 and not 0")))
                 } else {
@@ -367,7 +388,10 @@ fn check_drive(drive: &schema::Drive, field: impl Fn(&str) -> String) -> Result<
         schema::Drive::Eye { eye, pivot, range_degrees } => Drive::Eye {
             eye: *eye,
             pivot: pivot_of(*pivot)?,
-            range: [angle("drive.range_degrees[0]", range_degrees[0], 1.0, 60.0)?, angle("drive.range_degrees[1]", range_degrees[1], 1.0, 60.0)?],
+            range: [
+                angle("drive.range_degrees[0]", range_degrees[0], 1.0, 60.0)?,
+                angle("drive.range_degrees[1]", range_degrees[1], 1.0, 60.0)?,
+            ],
         },
         schema::Drive::Still => Drive::Still,
     })
@@ -380,9 +404,14 @@ fn check_groups(given: &[Vec<String>], index_of: &BTreeMap<&str, usize>) -> Resu
         let mut group = Vec::with_capacity(names.len());
         for name in names {
             let field = || format!("RHYTID_face.groups[{g}]");
-            let &bone = index_of.get(name.as_str()).ok_or_else(|| CharacterError::field(field(), format!("names {name:?}, which is no bone of this character")))?;
+            let &bone = index_of
+                .get(name.as_str())
+                .ok_or_else(|| CharacterError::field(field(), format!("names {name:?}, which is no bone of this character")))?;
             if std::mem::replace(&mut is_taken[bone], true) {
-                return Err(CharacterError::field(field(), format!("names {name:?}, which is in a group already; a bone belongs to one at most")));
+                return Err(CharacterError::field(
+                    field(),
+                    format!("names {name:?}, which is in a group already; a bone belongs to one at most"),
+                ));
             }
             group.push(bone);
         }
@@ -398,7 +427,10 @@ fn check_poses(given: &[schema::Pose], bones: &[Bone], index_of: &BTreeMap<&str,
     let mut poses = Vec::with_capacity(given.len());
     for (k, pose) in given.iter().enumerate() {
         if pose.name.is_empty() || pose.name.len() > 64 || given[..k].iter().any(|other| other.name == pose.name) {
-            return Err(CharacterError::field(format!("RHYTID_face.poses[{k}].name"), format!("is {:?}, expected 1 to 64 bytes, unique", pose.name)));
+            return Err(CharacterError::field(
+                format!("RHYTID_face.poses[{k}].name"),
+                format!("is {:?}, expected 1 to 64 bytes, unique", pose.name),
+            ));
         }
         let mut points: Vec<Vec3> = bones.iter().map(|bone| bone.rest).collect();
         for (name, point) in &pose.bones {
@@ -407,19 +439,29 @@ fn check_poses(given: &[schema::Pose], bones: &[Bone], index_of: &BTreeMap<&str,
             let point = check_point(*point, field)?;
             let travel = point - bones[bone].rest;
             if travel.length() > 0.0 && travel.length() < MIN_POSE_TRAVEL {
-                return Err(CharacterError::field(field(), format!("moves the bone by {:.3} mm, expected nothing or at least {} mm", travel.length() * 1e3, MIN_POSE_TRAVEL * 1e3)));
+                return Err(CharacterError::field(
+                    field(),
+                    format!("moves the bone by {:.3} mm, expected nothing or at least {} mm", travel.length() * 1e3, MIN_POSE_TRAVEL * 1e3),
+                ));
             }
             if travel.abs().max_element() > MAX_BONE_TRAVEL {
-                return Err(CharacterError::field(field(), format!("moves the bone by {travel} m, expected within ±{MAX_BONE_TRAVEL} m an axis")));
+                return Err(CharacterError::field(
+                    field(),
+                    format!("moves the bone by {travel} m, expected within ±{MAX_BONE_TRAVEL} m an axis"),
+                ));
             }
             points[bone] = point;
         }
         if let Some(map) = &pose.map
             && !(map.scale > 0.0 && map.scale <= 4.0)
         {
-            return Err(CharacterError::field(format!("RHYTID_face.poses[{k}].map.scale"), format!("is {}, expected more than 0 and at most 4", map.scale)));
+            return Err(CharacterError::field(
+                format!("RHYTID_face.poses[{k}].map.scale"),
+                format!("is {}, expected more than 0 and at most 4", map.scale),
+            ));
         }
-        let map = pose.map.as_ref().map(|map| WrinkleMap { texture: map.texture, scale: map.scale, contains_neutral: map.contains_neutral });
+        let map =
+            pose.map.as_ref().map(|map| WrinkleMap { texture: map.texture, scale: map.scale, contains_neutral: map.contains_neutral });
         poses.push(Pose { name: pose.name.clone(), points, map });
     }
     Ok(poses)
@@ -429,7 +471,10 @@ fn check_correctives(given: &[schema::Corrective], index_of: &BTreeMap<&str, usi
     // Each example costs a Gaussian and a row a frame, and a dense solve at load.
     const MAX_CORRECTIVES: usize = 64;
     if given.len() > MAX_CORRECTIVES {
-        return Err(CharacterError::field("RHYTID_face.correctives", format!("has {} examples, at most {MAX_CORRECTIVES} are allowed", given.len())));
+        return Err(CharacterError::field(
+            "RHYTID_face.correctives",
+            format!("has {} examples, at most {MAX_CORRECTIVES} are allowed", given.len()),
+        ));
     }
     let mut correctives = Vec::with_capacity(given.len());
     for (e, corrective) in given.iter().enumerate() {
@@ -448,7 +493,10 @@ fn check_correctives(given: &[schema::Corrective], index_of: &BTreeMap<&str, usi
             let &bone = index_of.get(name.as_str()).ok_or_else(|| CharacterError::field(field(), "is no bone of this character"))?;
             let delta = Vec3::from(delta);
             if !delta.is_finite() || delta.abs().max_element() > MAX_BONE_TRAVEL {
-                return Err(CharacterError::field(field(), format!("is {delta} m, expected finite and within ±{MAX_BONE_TRAVEL} m an axis")));
+                return Err(CharacterError::field(
+                    field(),
+                    format!("is {delta} m, expected finite and within ±{MAX_BONE_TRAVEL} m an axis"),
+                ));
             }
             bones.push((bone, delta));
         }

@@ -35,7 +35,10 @@ pub(super) fn load(bytes: &[u8]) -> Result<Character> {
     let mut character = Character::from_schema(&face, rest_of[face.head.as_str()], hex(&Sha256::digest(bytes)))?;
     for (i, bone) in character.bones.iter().enumerate() {
         if !rest_of.contains_key(bone.joint.as_str()) {
-            return Err(CharacterError::field(format!("RHYTID_face.bones[{i}].joint"), format!("{:?} is not a joint of the skin", bone.joint)));
+            return Err(CharacterError::field(
+                format!("RHYTID_face.bones[{i}].joint"),
+                format!("{:?} is not a joint of the skin", bone.joint),
+            ));
         }
     }
     check_images(document, blob, &character)?;
@@ -72,7 +75,9 @@ fn check_skin(document: &gltf::Document, face: &Face) -> Result<BTreeMap<String,
     for joint in skin.joints() {
         let world: glam::Mat4 = world_of[joint.index()]
             .ok_or_else(|| CharacterError::field(format!("nodes[{}]", joint.index()), "is a joint but stands in no scene"))?;
-        let name = joint.name().ok_or_else(|| CharacterError::field(format!("nodes[{}].name", joint.index()), "is missing, expected joints to be named"))?;
+        let name = joint
+            .name()
+            .ok_or_else(|| CharacterError::field(format!("nodes[{}].name", joint.index()), "is missing, expected joints to be named"))?;
         rest_of.insert(name.to_owned(), world.w_axis.truncate());
     }
     if !rest_of.contains_key(&face.head) {
@@ -116,14 +121,19 @@ fn check_images(document: &gltf::Document, blob: &[u8], character: &Character) -
     let mut first: Option<(u32, u32)> = None;
     for (k, map) in character.poses.iter().enumerate().filter_map(|(k, pose)| Some((k, pose.map?))) {
         let field = format!("RHYTID_face.poses[{k}].map.texture");
-        let texture = textures.get(map.texture).ok_or_else(|| CharacterError::field(&field, format!("is {}, but there are {} textures", map.texture, textures.len())))?;
+        let texture = textures
+            .get(map.texture)
+            .ok_or_else(|| CharacterError::field(&field, format!("is {}, but there are {} textures", map.texture, textures.len())))?;
         let (width, height) = size_of[texture.source().index()];
         if width != height || !width.is_power_of_two() {
             return Err(CharacterError::field(&field, format!("is {width} x {height}, expected a square with a power of two a side")));
         }
         let expected = *first.get_or_insert((width, height));
         if expected != (width, height) {
-            return Err(CharacterError::field(&field, format!("is {width} x {height}, expected {} x {} as the first: wrinkle maps share one array", expected.0, expected.1)));
+            return Err(CharacterError::field(
+                &field,
+                format!("is {width} x {height}, expected {} x {} as the first: wrinkle maps share one array", expected.0, expected.1),
+            ));
         }
     }
     Ok(())
@@ -145,7 +155,10 @@ fn check_meshes(document: &gltf::Document, blob: &[u8], character: &mut Characte
                 check_accessor(&accessor, blob, &format!("{field}.indices"))?;
             }
             if primitive.get(&Semantic::Joints(1)).is_some() {
-                return Err(CharacterError::field(format!("{field}.attributes.JOINTS_1"), "is present, expected at most 4 weights a vertex"));
+                return Err(CharacterError::field(
+                    format!("{field}.attributes.JOINTS_1"),
+                    "is present, expected at most 4 weights a vertex",
+                ));
             }
             let positions: Vec<Vec3> = reader
                 .read_positions()
@@ -210,7 +223,10 @@ where
     let Some(indices) = reader.read_indices() else { return Ok(()) };
     for (at, index) in indices.into_u32().enumerate() {
         if index as usize >= num_vertices {
-            return Err(CharacterError::field(format!("{field}.indices[{at}]"), format!("is {index}, but there are {num_vertices} vertices")));
+            return Err(CharacterError::field(
+                format!("{field}.indices[{at}]"),
+                format!("is {index}, but there are {num_vertices} vertices"),
+            ));
         }
     }
     Ok(())
@@ -228,7 +244,10 @@ where
         num_read += 1;
         for (joint, weight) in joints.into_iter().zip(weights) {
             if usize::from(joint) >= num_joints {
-                return Err(CharacterError::field(format!("{field}.attributes.JOINTS_0[{v}]"), format!("is {joint}, but there are {num_joints} joints")));
+                return Err(CharacterError::field(
+                    format!("{field}.attributes.JOINTS_0[{v}]"),
+                    format!("is {joint}, but there are {num_joints} joints"),
+                ));
             }
             if !(0.0..=1.0 + WEIGHT_SUM_TOLERANCE).contains(&weight) {
                 return Err(CharacterError::field(format!("{field}.attributes.WEIGHTS_0[{v}]"), format!("is {weight}, expected 0 to 1")));
@@ -240,7 +259,10 @@ where
         }
     }
     if num_read != num_vertices {
-        return Err(CharacterError::field(format!("{field}.attributes"), format!("have {num_read} joints and weights for {num_vertices} vertices")));
+        return Err(CharacterError::field(
+            format!("{field}.attributes"),
+            format!("have {num_read} joints and weights for {num_vertices} vertices"),
+        ));
     }
     Ok(())
 }
@@ -264,13 +286,19 @@ where
     const MAX_TARGETS: usize = 4 * NUM_ARKIT_SHAPES;
     let num_targets = primitive.morph_targets().count();
     if num_targets > MAX_TARGETS {
-        return Err(CharacterError::field(format!("{field}.targets"), format!("has {num_targets} targets, at most {MAX_TARGETS} are allowed")));
+        return Err(CharacterError::field(
+            format!("{field}.targets"),
+            format!("has {num_targets} targets, at most {MAX_TARGETS} are allowed"),
+        ));
     }
     for (t, target) in primitive.morph_targets().enumerate() {
         for accessor in [target.positions(), target.normals(), target.tangents()].into_iter().flatten() {
             check_accessor(&accessor, blob, &format!("{field}.targets[{t}]"))?;
             if accessor.count() != positions.len() {
-                return Err(CharacterError::field(format!("{field}.targets[{t}]"), format!("has {} elements for {} vertices", accessor.count(), positions.len())));
+                return Err(CharacterError::field(
+                    format!("{field}.targets[{t}]"),
+                    format!("has {} elements for {} vertices", accessor.count(), positions.len()),
+                ));
             }
         }
     }

@@ -1,0 +1,407 @@
+//! One publish session's messages, checked in their order.
+
+use super::fields::{Fields, Kind, LayoutField};
+use super::{MessageError, PublishHello, PublishMessage, TrackingData, TrackingFrame};
+use crate::character::Character;
+use crate::face::HeadPose;
+use crate::layout::Layout;
+use crate::limits::MAX_FEATURE_POINTS;
+use crate::names::NUM_ARKIT_SHAPES;
+use crate::view::PROTOCOL_VERSION;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Largest `t`, seconds: the Unix clock stays below it for three centuries, and it fits a packet's microseconds.
+const MAX_SECONDS: f64 = 1e10;
+/// Largest side of a tracker's picture and largest focal length, pixels.
+const MAX_IMAGE: f64 = 1e5;
+/// Most frames a second a hello may claim: faster than any face camera.
+const MAX_FPS: f64 = 1000.0;
+
+/// Reads the text messages of one publish session, or the lines of a feed file, without building a tree of JSON.
+#[derive(Debug, Clone)]
+pub struct PublishReader {
+    bones: BTreeMap<String, usize>,
+    features: BTreeSet<String>,
+    fields: Fields,
+    hello: Option<PublishHello>,
+    last_t: Option<f64>,
+}
+
+impl PublishReader {
+    /// A reader for a session that drives `character`, whose names `bones` and named layouts must use.
+    pub fn new(character: &Character) -> Self {
+        Self {
+            bones: character.bones.iter().enumerate().map(|(i, bone)| (bone.name.clone(), i)).collect(),
+            features: character.features.keys().cloned().collect(),
+            fields: Fields::new(),
+            hello: None,
+            last_t: None,
+        }
+    }
+
+    /// Reads one message. A frame is written into `frame`, whose buffers are reused; after an error `frame` is as it was.
+    pub fn read(&mut self, text: &str, frame: &mut TrackingFrame) -> Result<PublishMessage, MessageError> {
+        self.fields.read(text, &self.bones)?;
+        if let Some(problem) = self.fields.problem.take() {
+            return Err(problem);
+        }
+        let kind = self.fields.kind.ok_or_else(|| missing("type", "\"hello\", \"frame\" or \"calibrate\""))?;
+        match (kind, &self.hello) {
+            (Kind::Hello, Some(_)) => {
+                Err(MessageError::new("repeated_hello", "field type is \"hello\" a second time, expected one hello a session"))
+            }
+            (Kind::Hello, None) => {
+                let hello = self.check_hello()?;
+                self.hello = Some(hello.clone());
+                Ok(PublishMessage::Hello(hello))
+            }
+            (Kind::Frame | Kind::Calibrate, None) => {
+                Err(MessageError::new("no_hello", "the first message must be {\"type\":\"hello\",\"version\":1,…}"))
+            }
+            (Kind::Calibrate, Some(_)) => Ok(PublishMessage::Calibrate),
+            (Kind::Frame, Some(_)) => self.check_frame(frame).map(|()| PublishMessage::Frame),
+        }
+    }
+
+    fn check_hello(&mut self) -> Result<PublishHello, MessageError> {
+        let fields = &mut self.fields;
+        let version = fields.version.ok_or_else(|| missing("version", "1"))?;
+        if version != f64::from(PROTOCOL_VERSION) {
+            return Err(MessageError::new("unknown_version", format!("field version is {version}, this server speaks {PROTOCOL_VERSION}")));
+        }
+        let within = |field: &str, value: f64, most: f64, unit: &str| {
+            if value > 0.0 && value <= most {
+                Ok(value as f32)
+            } else {
+                Err(MessageError::new("out_of_range", format!("field {field} is {value}, expected {unit}, more than 0 and at most {most}")))
+            }
+        };
+        let layout = fields.layout.take().map(|layout| check_layout(layout, &self.features)).transpose()?;
+        let image = match fields.image {
+            Some([width, height]) => {
+                Some([within("image[0]", width, MAX_IMAGE, "pixels")?, within("image[1]", height, MAX_IMAGE, "pixels")?])
+            }
+            None => None,
+        };
+        if layout.is_some() && image.is_none() {
+            return Err(missing("image", "[width, height] of the tracker's picture, because the hello names a layout"));
+        }
+        Ok(PublishHello {
+            source: fields.source.take().unwrap_or_default(),
+            fps: fields.fps.map(|fps| within("fps", fps, MAX_FPS, "frames a second")).transpose()?,
+            layout,
+            image,
+            focal: fields.focal.map(|focal| within("focal", focal, MAX_IMAGE, "pixels")).transpose()?,
+            takeover: fields.takeover,
+        })
+    }
+
+    fn check_frame(&mut self, frame: &mut TrackingFrame) -> Result<(), MessageError> {
+        let fields = &mut self.fields;
+        let t = fields.t.ok_or_else(|| missing("t", "seconds on the sender's clock"))?;
+        if !(0.0..=MAX_SECONDS).contains(&t) {
+            return Err(MessageError::new("out_of_range", format!("field t is {t}, expected seconds from 0 to {MAX_SECONDS}")));
+        }
+        if let Some(last) = self.last_t
+            && t <= last
+        {
+            return Err(MessageError::new("time_order", format!("field t is {t}, expected more than the {last} of the frame before")));
+        }
+        let head = (fields.head_rotation.is_some() || fields.head_position.is_some())
+            .then(|| HeadPose { rotation: fields.head_rotation.unwrap_or_default(), position: fields.head_position.unwrap_or_default() });
+        match (fields.has_landmarks, fields.has_weights, fields.has_bones) {
+            _ if fields.face == Some(false) => frame.data = TrackingData::NoFace,
+            (true, false, false) => check_landmarks(fields, self.hello.as_ref().and_then(|hello| hello.layout.as_ref()), &mut frame.data)?,
+            (false, true, false) => {
+                if !matches!(frame.data, TrackingData::Weights { .. }) {
+                    frame.data = TrackingData::Weights { weights: Box::new([0.0; NUM_ARKIT_SHAPES]), head: None };
+                }
+                if let TrackingData::Weights { weights, head: slot } = &mut frame.data {
+                    weights.copy_from_slice(&fields.weights[..]);
+                    *slot = head;
+                }
+            }
+            (false, false, true) => {
+                if !matches!(frame.data, TrackingData::Bones { .. }) {
+                    frame.data = TrackingData::Bones { points: Vec::new(), head: None };
+                }
+                if let TrackingData::Bones { points, head: slot } = &mut frame.data {
+                    std::mem::swap(points, &mut fields.bones);
+                    *slot = head;
+                }
+            }
+            (false, false, false) => return Err(missing("landmarks", "landmarks, weights, bones or \"face\":false in a frame")),
+            _ => {
+                return Err(MessageError::new(
+                    "ambiguous_frame",
+                    "frame has several of the fields landmarks, weights and bones, expected one of them",
+                ));
+            }
+        }
+        frame.t = t;
+        self.last_t = Some(t);
+        Ok(())
+    }
+}
+
+fn missing(field: &str, expected: &str) -> MessageError {
+    MessageError::new("missing_field", format!("field {field} is missing, expected {expected}"))
+}
+
+fn check_layout(layout: LayoutField, features: &BTreeSet<String>) -> Result<Layout, MessageError> {
+    let names = match layout {
+        LayoutField::Name(name) => {
+            return match name.as_str() {
+                "ibug68" => Ok(Layout::Ibug68),
+                "mediapipe478" => Ok(Layout::Mediapipe478),
+                "openseeface66" => Ok(Layout::OpenSeeFace66),
+                _ => Err(MessageError::new(
+                    "unknown_layout",
+                    format!(
+                        "field layout is {:?}, expected \"ibug68\", \"mediapipe478\", \"openseeface66\" or a list of feature points",
+                        name.chars().take(40).collect::<String>()
+                    ),
+                )),
+            };
+        }
+        LayoutField::List(names) => names,
+    };
+    if names.is_empty() || names.len() > MAX_FEATURE_POINTS {
+        return Err(MessageError::new(
+            "unknown_layout",
+            format!("field layout has {} names, expected 1 to {MAX_FEATURE_POINTS}", names.len()),
+        ));
+    }
+    let mut seen = BTreeSet::new();
+    for (i, name) in names.iter().enumerate() {
+        let shown: String = name.chars().take(40).collect();
+        if !features.contains(name) {
+            return Err(MessageError::new(
+                "unknown_layout",
+                format!("field layout[{i}] is {shown:?}, which is no feature point of this character"),
+            ));
+        }
+        if !seen.insert(name) {
+            return Err(MessageError::new(
+                "unknown_layout",
+                format!("field layout[{i}] is {shown:?} a second time, expected each name once"),
+            ));
+        }
+    }
+    Ok(Layout::Named(names))
+}
+
+fn check_landmarks(fields: &mut Fields, layout: Option<&Layout>, data: &mut TrackingData) -> Result<(), MessageError> {
+    let layout =
+        layout.ok_or_else(|| MessageError::new("no_layout", "frame has landmarks, expected field layout in the hello to say which"))?;
+    let (got, expected) = (fields.num_landmarks, layout.num_points());
+    if got != expected {
+        return Err(MessageError::new(
+            "wrong_count",
+            format!("field landmarks has {got} points, expected {expected} for layout {}", name_of(layout)),
+        ));
+    }
+    if fields.has_confidence && fields.confidence.len() != expected {
+        return Err(MessageError::new(
+            "wrong_count",
+            format!("field confidence has {} values, expected {expected}, one a landmark", fields.confidence.len()),
+        ));
+    }
+    if !fields.has_confidence {
+        fields.confidence.clear();
+    }
+    if !matches!(data, TrackingData::Landmarks { .. }) {
+        *data = TrackingData::Landmarks { points: Vec::new(), confidence: Vec::new() };
+    }
+    if let TrackingData::Landmarks { points, confidence } = data {
+        std::mem::swap(points, &mut fields.landmarks);
+        std::mem::swap(confidence, &mut fields.confidence);
+    }
+    Ok(())
+}
+
+fn name_of(layout: &Layout) -> &'static str {
+    match layout {
+        Layout::Ibug68 => "ibug68",
+        Layout::Mediapipe478 => "mediapipe478",
+        Layout::OpenSeeFace66 => "openseeface66",
+        Layout::Named(_) => "of the hello's own list",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::tiny_character;
+    use glam::Vec3;
+
+    const HELLO: &str =
+        r#"{"type":"hello","version":1,"source":"me","fps":25,"layout":["brow_l","brow_r"],"image":[400,300],"extra":{"a":[1]}}"#;
+
+    fn reader() -> (PublishReader, TrackingFrame) {
+        (PublishReader::new(&tiny_character()), TrackingFrame::default())
+    }
+
+    fn after_hello() -> (PublishReader, TrackingFrame) {
+        let (mut reader, mut frame) = reader();
+        reader.read(HELLO, &mut frame).unwrap();
+        (reader, frame)
+    }
+
+    #[test]
+    fn every_kind_of_frame_is_read() {
+        let (mut reader, mut frame) = after_hello();
+        let mut read = |text: &str| {
+            assert_eq!(reader.read(text, &mut frame), Ok(PublishMessage::Frame), "{text}");
+            frame.clone()
+        };
+        let got = read(r#"{"t":0,"nested":{"landmarks":[1]},"landmarks":[[1,2],[3,4.5,-6e0]],"confidence":[1.001,0],"type":"frame"}"#);
+        assert_eq!(got.data, TrackingData::Landmarks { points: vec![[1.0, 2.0, 0.0], [3.0, 4.5, -6.0]], confidence: vec![1.0, 0.0] });
+        let got = read(r#"{"type":"frame","t":0.5,"landmarks":[[1,2],[3,4]]}"#);
+        assert_eq!(
+            (got.t, got.data),
+            (0.5, TrackingData::Landmarks { points: vec![[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]], confidence: vec![] })
+        );
+        let got = read(
+            r#"{"type":"frame","t":1,"weights":{"jawOpen":0.25,"BrowInnerUp":1.5,"_neutral":0.9,"eyeBlink_L":-0.1},"head":{"rotation":[0,0,0,2],"position":[0,0.1,9]}}"#,
+        );
+        let TrackingData::Weights { weights, head } = got.data else { panic!("not weights") };
+        let of = |name| weights[crate::ArkitShape::from_name(name).unwrap().index()];
+        assert_eq!((of("jawOpen"), of("browInnerUp"), of("eyeBlinkLeft"), of("tongueOut")), (0.25, 1.2, 0.0, 0.0));
+        assert_eq!(head, Some(HeadPose { rotation: glam::Quat::IDENTITY, position: Vec3::new(0.0, 0.1, 0.3) }));
+        // A shape not named again is 0, not what it was.
+        let TrackingData::Weights { weights, head } = read(r#"{"type":"frame","t":1.5,"weights":{}}"#).data else { panic!("not weights") };
+        assert_eq!((*weights, head), ([0.0; NUM_ARKIT_SHAPES], None));
+        let got = read(r#"{"type":"frame","t":2,"bones":{"brow_r":[0,0.05,0.1]}}"#);
+        assert_eq!(got.data, TrackingData::Bones { points: vec![(1, Vec3::new(0.0, 0.05, 0.1))], head: None });
+        assert_eq!(read(r#"{"type":"frame","t":3,"face":false}"#).data, TrackingData::NoFace);
+        assert_eq!(reader.read(r#"{"type":"calibrate"}"#, &mut frame), Ok(PublishMessage::Calibrate));
+    }
+
+    #[test]
+    fn each_bad_frame_is_refused_with_its_field_and_changes_nothing() {
+        let (mut reader, mut frame) = after_hello();
+        reader.read(r#"{"type":"frame","t":1,"landmarks":[[1,2],[3,4]]}"#, &mut frame).unwrap();
+        let before = frame.clone();
+        for (text, code, says) in [
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4]"#, "malformed_json", "EOF"),
+            (r#"{"type":"frame","t":NaN,"landmarks":[[1,2],[3,4]]}"#, "malformed_json", "in field t"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[NaN,4]]}"#, "malformed_json", "in field landmarks"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[1e999,4]]}"#, "malformed_json", "number out of range"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4]]} x"#, "malformed_json", "trailing"),
+            ("[1,2]", "wrong_type", "expected a JSON object"),
+            (
+                r#"{"type":"frame","t":2,"landmarks":{"0":[1,2]}}"#,
+                "wrong_type",
+                "field landmarks: invalid type: map, expected an array of [x, y]",
+            ),
+            (
+                r#"{"type":"frame","t":2,"landmarks":[[1,null],[3,4]]}"#,
+                "wrong_type",
+                "field landmarks: invalid type: null, expected a number",
+            ),
+            (
+                r#"{"type":"frame","t":"2","landmarks":[[1,2],[3,4]]}"#,
+                "wrong_type",
+                "field t: invalid type: string \"2\", expected a number (seconds",
+            ),
+            (r#"{"type":"frame","landmarks":[[1,2],[3,4]]}"#, "missing_field", "field t is missing"),
+            (r#"{"type":"frame","t":2}"#, "missing_field", "landmarks, weights, bones or \"face\":false"),
+            (r#"{"t":2,"face":false}"#, "missing_field", "field type"),
+            (r#"{"type":"settings","t":2}"#, "unknown_type", "\"settings\""),
+            (r#"{"type":"frame","t":1,"face":false}"#, "time_order", "field t is 1, expected more than the 1"),
+            (r#"{"type":"frame","t":0.5,"face":false}"#, "time_order", "expected more than the 1"),
+            (r#"{"type":"frame","t":-1,"face":false}"#, "out_of_range", "field t is -1"),
+            (r#"{"type":"frame","t":1e300,"face":false}"#, "out_of_range", "field t"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2]]}"#, "wrong_count", "field landmarks has 1 points, expected 2"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4],[5,6]]}"#, "wrong_count", "has 3 points"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3]]}"#, "wrong_count", "landmarks[1] has 1 numbers"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4,5,6]]}"#, "wrong_count", "landmarks[1] has 4 numbers"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4e5]]}"#, "out_of_range", "landmarks[1] is"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4]],"confidence":[1]}"#, "wrong_count", "confidence has 1 values, expected 2"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4]],"confidence":[1,-3]}"#, "out_of_range", "confidence[1] is -3"),
+            (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4]],"weights":{}}"#, "ambiguous_frame", "expected one"),
+            (r#"{"type":"frame","t":2,"weights":{"jawOpen":45}}"#, "out_of_range", "weights.jawOpen is 45, expected 0 to 1"),
+            (r#"{"type":"frame","t":2,"weights":{"Jaw":0.5}}"#, "unknown_shape", "none is an ARKit shape"),
+            (r#"{"type":"frame","t":2,"weights":[0.5]}"#, "wrong_type", "field weights"),
+            (r#"{"type":"frame","t":2,"weights":{},"head":{"rotation":[0,0,0,0]}}"#, "out_of_range", "head.rotation"),
+            (r#"{"type":"frame","t":2,"weights":{},"head":{"position":[0,0,100]}}"#, "out_of_range", "head.position"),
+            (r#"{"type":"frame","t":2,"bones":{"tail":[0,0,0]}}"#, "unknown_bone", "bones.tail"),
+            (
+                r#"{"type":"frame","t":2,"bones":{"brow_l":[0,50,0]}}"#,
+                "out_of_range",
+                "bones.brow_l is [0.0, 50.0, 0.0], expected 3 numbers, metres",
+            ),
+            (r#"{"type":"frame","t":2,"bones":{"brow_l":[0,0]}}"#, "out_of_range", "bones.brow_l"),
+            (HELLO, "repeated_hello", "one hello a session"),
+        ] {
+            let error = reader.read(text, &mut frame).expect_err(text);
+            assert_eq!(error.code, code, "{text}: {error}");
+            assert!(error.message.contains(says), "{text}: {error}");
+            assert_eq!(frame, before, "{text}");
+        }
+        reader.read(r#"{"type":"frame","t":1.01,"face":false}"#, &mut frame).unwrap();
+    }
+
+    #[test]
+    fn each_bad_hello_is_refused_with_its_field() {
+        for (text, code, says) in [
+            (r#"{"type":"frame","t":0,"face":false}"#, "no_hello", "first message must be"),
+            (r#"{"type":"calibrate"}"#, "no_hello", "first message must be"),
+            (r#"{"type":"hello"}"#, "missing_field", "field version is missing, expected 1"),
+            (r#"{"type":"hello","version":2}"#, "unknown_version", "field version is 2, this server speaks 1"),
+            (r#"{"type":"hello","version":"1"}"#, "wrong_type", "field version"),
+            (r#"{"type":"hello","version":1,"layout":"dlib5"}"#, "unknown_layout", "\"dlib5\", expected \"ibug68\""),
+            (r#"{"type":"hello","version":1,"layout":5}"#, "wrong_type", "expected the name of a layout"),
+            (r#"{"type":"hello","version":1,"layout":[]}"#, "unknown_layout", "has 0 names"),
+            (r#"{"type":"hello","version":1,"layout":["brow_l","toe"]}"#, "unknown_layout", "layout[1] is \"toe\""),
+            (r#"{"type":"hello","version":1,"layout":["brow_l","brow_l"]}"#, "unknown_layout", "second time"),
+            (r#"{"type":"hello","version":1,"layout":"ibug68"}"#, "missing_field", "field image"),
+            (r#"{"type":"hello","version":1,"layout":"ibug68","image":[0,5]}"#, "out_of_range", "image[0]"),
+            (r#"{"type":"hello","version":1,"layout":"ibug68","image":[5,5,5]}"#, "wrong_count", "image has 3 numbers"),
+            (r#"{"type":"hello","version":1,"focal":-1}"#, "out_of_range", "focal"),
+            (r#"{"type":"hello","version":1,"fps":0}"#, "out_of_range", "fps"),
+            (
+                r#"{"type":"hello","version":1,"takeover":"yes"}"#,
+                "wrong_type",
+                "field takeover: invalid type: string \"yes\", expected true or false",
+            ),
+        ] {
+            let (mut reader, mut frame) = reader();
+            let error = reader.read(text, &mut frame).expect_err(text);
+            assert_eq!(error.code, code, "{text}: {error}");
+            assert!(error.message.contains(says), "{text}: {error}");
+        }
+        let (mut reader, mut frame) = reader();
+        let name = "é".repeat(500);
+        let Ok(PublishMessage::Hello(hello)) = reader.read(&format!(r#"{{"type":"hello","version":1,"source":"{name}"}}"#), &mut frame)
+        else {
+            panic!("refused")
+        };
+        assert_eq!((hello.source.chars().count(), hello.layout, hello.takeover), (128, None, false));
+    }
+
+    #[test]
+    fn too_many_points_are_counted_not_kept() {
+        let (mut reader, mut frame) = after_hello();
+        let points = vec!["[1,2]"; 40_000].join(",");
+        let error = reader.read(&format!(r#"{{"type":"frame","t":2,"landmarks":[{points}]}}"#), &mut frame).unwrap_err();
+        assert!(error.message.contains("has 40000 points"), "{error}");
+        assert!(reader.fields.landmarks.capacity() <= 2 * MAX_FEATURE_POINTS);
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn no_text_panics(at in 0usize..120, byte in 0u8..128, cut in 0usize..120) {
+            let (mut reader, mut frame) = after_hello();
+            let good = r#"{"type":"frame","t":2,"bones":{"brow_l":[0,0.05,0.1]},"head":{"rotation":[0,0,0,1]},"face":true}"#;
+            let mut bytes = good.as_bytes().to_vec();
+            let last = bytes.len() - 1;
+            bytes[at.min(last)] = byte;
+            bytes.truncate(cut.max(1));
+            if let Ok(text) = std::str::from_utf8(&bytes) {
+                let _ = reader.read(text, &mut frame);
+            }
+        }
+    }
+}
