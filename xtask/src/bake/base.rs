@@ -1,0 +1,114 @@
+//! The MakeHuman body as one adult individual: macro targets mixed, made slightly asymmetric, relaxed to a neutral
+//! expression, and put into head space.
+
+use super::obj::{Obj, parse_target};
+use super::source::Source;
+use anyhow::{Result, ensure};
+use glam::Vec3;
+use rhytid_shared::ARKIT_NAMES;
+
+/// MakeHuman's unit is the decimetre.
+const METRES_PER_UNIT: f32 = 0.1;
+
+/// Who it is: MakeHuman's own macro targets and their weights; ancestry sums to one. Tuned by eye.
+const MACROS: [(&str, f32); 8] = [
+    ("caucasian-male-young", 0.40),
+    ("african-male-young", 0.14),
+    ("asian-male-young", 0.16),
+    ("caucasian-female-young", 0.18),
+    ("african-female-young", 0.06),
+    ("asian-female-young", 0.06),
+    ("universal-male-young-averagemuscle-averageweight", 0.70),
+    ("universal-female-young-averagemuscle-averageweight", 0.30),
+];
+
+/// Expression shapes mixed into the neutral: the plain MakeHuman face reads as a frown (a tracker sees browDown 0.44).
+const NEUTRAL_SHAPES: [(&str, f32); 5] =
+    [("browDownLeft", -0.50), ("browDownRight", -0.50), ("browInnerUp", 0.15), ("browOuterUpLeft", 0.08), ("browOuterUpRight", 0.08)];
+
+/// Waves of the asymmetry: `(direction and wave number, radians a metre; phase; displacement, metres)`. Long waves, so
+/// that halves differ as halves of a face do and no feature is bent. Tuned by eye; the sum stays below 1 mm.
+const ASYMMETRY: [(Vec3, f32, Vec3); 4] = [
+    (Vec3::new(31.0, 12.0, 8.0), 0.6, Vec3::new(0.00022, 0.00030, 0.00018)),
+    (Vec3::new(-18.0, 37.0, 11.0), 2.1, Vec3::new(0.00026, 0.00014, 0.00022)),
+    (Vec3::new(44.0, -21.0, 15.0), 4.0, Vec3::new(0.00010, 0.00024, 0.00014)),
+    (Vec3::new(23.0, 29.0, -33.0), 5.2, Vec3::new(0.00012, 0.00018, 0.00020)),
+];
+
+/// The whole base mesh with its helpers. Metres, head space: origin between the ears at the height of the eyes.
+pub struct Base {
+    /// Topology, UVs and groups (its positions are the raw ones).
+    pub obj: Obj,
+    /// Neutral position of every vertex of the `.obj`.
+    pub positions: Vec<Vec3>,
+    /// `morphs[shape]`: displacements of the vertices the shape moves, in [`ARKIT_NAMES`]' order.
+    pub morphs: Vec<Vec<(u32, Vec3)>>,
+}
+
+impl Base {
+    /// Reads and mixes the sources. `ears` are the base vertices between which the origin lies.
+    pub fn load(source: &mut Source, ears: [u32; 2]) -> Result<Self> {
+        let obj = Obj::parse(&source.read_text("mpfb2/3dobjs/base.obj")?)?;
+        let mut positions = obj.positions.clone();
+        let mut read = |name: &str| -> Result<Vec<(u32, Vec3)>> {
+            let deltas = parse_target(&source.read_text(name)?)?;
+            ensure!(deltas.iter().all(|&(v, _)| (v as usize) < obj.positions.len()), "{name} moves a vertex the mesh lacks");
+            Ok(deltas)
+        };
+        for (name, weight) in MACROS {
+            for (v, delta) in read(&format!("mpfb2/targets/macrodetails/{name}.target.gz"))? {
+                positions[v as usize] += delta * weight;
+            }
+        }
+        let mut morphs = Vec::with_capacity(ARKIT_NAMES.len());
+        for name in ARKIT_NAMES {
+            let deltas = read(&format!("faceunits01/targets/faceunits/{name}.target"))?;
+            if let Some(&(_, weight)) = NEUTRAL_SHAPES.iter().find(|(shape, _)| *shape == name) {
+                deltas.iter().for_each(|&(v, delta)| positions[v as usize] += delta * weight);
+            }
+            morphs.push(deltas.into_iter().map(|(v, delta)| (v, delta * METRES_PER_UNIT)).collect());
+        }
+
+        let eyes = mean(&positions, &[obj.vertices_of("helper-l-eye"), obj.vertices_of("helper-r-eye")].concat());
+        let ears = mean(&positions, &ears);
+        let origin = Vec3::new(0.0, eyes.y, ears.z);
+        for position in &mut positions {
+            *position = (*position - origin) * METRES_PER_UNIT;
+            *position += asymmetry(*position);
+        }
+        Ok(Self { obj, positions, morphs })
+    }
+
+    /// Displacement of every vertex by one shape.
+    pub fn dense_morph(&self, shape: usize) -> Vec<Vec3> {
+        let mut dense = vec![Vec3::ZERO; self.positions.len()];
+        self.morphs[shape].iter().for_each(|&(v, delta)| dense[v as usize] = delta);
+        dense
+    }
+}
+
+/// Mean position of the listed vertices.
+pub fn mean(positions: &[Vec3], vertices: &[u32]) -> Vec3 {
+    vertices.iter().map(|&v| positions[v as usize]).sum::<Vec3>() / vertices.len().max(1) as f32
+}
+
+fn asymmetry(position: Vec3) -> Vec3 {
+    ASYMMETRY.iter().map(|&(wave, phase, amplitude)| amplitude * libm::sinf(wave.dot(position) + phase)).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn asymmetry_is_small_and_differs_between_the_halves() {
+        let mut largest_difference = 0.0_f32;
+        for i in 0..1000 {
+            let p = Vec3::new(0.08 * ((i % 10) as f32 / 10.0), -0.1 + 0.2 * ((i / 10 % 10) as f32 / 10.0), 0.12 * (i / 100) as f32 / 10.0);
+            let (left, right) = (asymmetry(p), asymmetry(p * Vec3::new(-1.0, 1.0, 1.0)));
+            assert!(left.length() < 1.0e-3);
+            largest_difference = largest_difference.max((left.y - right.y).abs());
+        }
+        assert!(largest_difference > 3.0e-4, "halves differ by {largest_difference} m only");
+    }
+}

@@ -1,0 +1,170 @@
+//! Seeded noise over space. Integer hashes and plain arithmetic only, so that every machine paints the same face.
+
+use glam::Vec3;
+
+/// A hash of a lattice point, uniform over 32 bits.
+pub fn hash(x: i32, y: i32, z: i32, seed: u32) -> u32 {
+    let mut h = (x as u32).wrapping_mul(0x8da6_b343) ^ (y as u32).wrapping_mul(0xd816_3841) ^ (z as u32).wrapping_mul(0xcb1a_b31f);
+    h = h.wrapping_add(seed.wrapping_mul(0x9e37_79b9));
+    mix(h)
+}
+
+/// Uniform in [0, 1).
+pub fn unit(hash: u32) -> f32 {
+    (hash >> 8) as f32 * (1.0 / 16_777_216.0)
+}
+
+/// A small stream of random numbers for things that are scattered.
+pub struct Dice(u32);
+
+impl Dice {
+    /// The stream of `seed`.
+    pub fn new(seed: u32) -> Self {
+        Self(mix(seed.wrapping_add(0x6d2b_79f5)))
+    }
+
+    /// Uniform in [0, 1).
+    pub fn unit(&mut self) -> f32 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9);
+        unit(mix(self.0))
+    }
+
+    /// Uniform in [low, high).
+    pub fn range(&mut self, low: f32, high: f32) -> f32 {
+        low + (high - low) * self.unit()
+    }
+
+    /// Uniform in [-1, 1).
+    pub fn signed(&mut self) -> f32 {
+        self.range(-1.0, 1.0)
+    }
+}
+
+/// Smooth noise with features of about one unit, in [-1, 1] with mean 0 (gradient noise, quintic fade).
+pub fn noise(p: Vec3, seed: u32) -> f32 {
+    let base = p.floor();
+    let f = p - base;
+    let (x, y, z) = (base.x as i32, base.y as i32, base.z as i32);
+    let corner = |dx: i32, dy: i32, dz: i32| {
+        let h = hash(x + dx, y + dy, z + dz, seed);
+        let away = f - Vec3::new(dx as f32, dy as f32, dz as f32);
+        // Ten bits a component: directions need not be evenly spread, only without a preferred axis.
+        let gradient = |shift: u32| ((h >> shift) & 1023) as f32 * (2.0 / 1023.0) - 1.0;
+        gradient(0) * away.x + gradient(10) * away.y + gradient(20) * away.z
+    };
+    let fade = f * f * f * (f * (f * 6.0 - Vec3::splat(15.0)) + Vec3::splat(10.0));
+    let along_x = |dy: i32, dz: i32| lerp(corner(0, dy, dz), corner(1, dy, dz), fade.x);
+    let along_y = |dz: i32| lerp(along_x(0, dz), along_x(1, dz), fade.y);
+    1.3 * lerp(along_y(0), along_y(1), fade.z)
+}
+
+/// Sum of `octaves` of [`noise`], each twice as fine and half as strong.
+pub fn fractal(p: Vec3, octaves: u32, seed: u32) -> f32 {
+    let (mut sum, mut strength, mut p) = (0.0, 1.0, p);
+    for octave in 0..octaves {
+        sum += strength * noise(p, seed.wrapping_add(octave * 7919));
+        strength *= 0.5;
+        p = p * 2.03 + Vec3::splat(17.3);
+    }
+    sum
+}
+
+/// Distances to the nearest two of the points strewn one per unit cell, and the nearest point's own hash.
+pub struct Cell {
+    /// Distance to the nearest point.
+    pub first: f32,
+    /// Distance to the second nearest.
+    pub second: f32,
+    /// Hash of the nearest point.
+    pub id: u32,
+}
+
+/// Cellular noise (Worley 1996).
+pub fn cells(p: Vec3, seed: u32) -> Cell {
+    let base = p.floor();
+    let f = p - base;
+    let (x, y, z) = (base.x as i32, base.y as i32, base.z as i32);
+    let (mut first, mut second, mut id) = (f32::MAX, f32::MAX, 0);
+    for dz in -1..=1 {
+        for dy in -1..=1 {
+            for dx in -1..=1 {
+                let h = hash(x + dx, y + dy, z + dz, seed);
+                let jitter = |shift: u32| ((h >> shift) & 1023) as f32 * (1.0 / 1023.0);
+                let ax = dx as f32 + jitter(0) - f.x;
+                let ay = dy as f32 + jitter(10) - f.y;
+                let az = dz as f32 + jitter(20) - f.z;
+                let distance = ax * ax + ay * ay + az * az;
+                if distance < first {
+                    second = first;
+                    first = distance;
+                    id = h;
+                } else if distance < second {
+                    second = distance;
+                }
+            }
+        }
+    }
+    Cell { first: first.sqrt(), second: second.sqrt(), id: mix(id) }
+}
+
+/// 0 below `low`, 1 above `high`, smooth between; falls where `low > high`.
+pub fn smoothstep(low: f32, high: f32, x: f32) -> f32 {
+    let t = ((x - low) / (high - low)).clamp(0.0, 1.0);
+    t * t * (3.0 - 2.0 * t)
+}
+
+/// `a` at 0, `b` at 1.
+pub fn lerp(a: f32, b: f32, t: f32) -> f32 {
+    a + (b - a) * t
+}
+
+/// A bell of height 1 at 0; 0.37 at `x = width`.
+pub fn bell(x: f32, width: f32) -> f32 {
+    let t = x / width;
+    libm::expf(-t * t)
+}
+
+fn mix(mut h: u32) -> u32 {
+    h ^= h >> 16;
+    h = h.wrapping_mul(0x7feb_352d);
+    h ^= h >> 15;
+    h = h.wrapping_mul(0x846c_a68b);
+    h ^ (h >> 16)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn noise_is_the_same_everywhere() {
+        // Frozen on purpose: another hash would be another face.
+        let p = Vec3::new(1.25, -3.5, 7.75);
+        let bits = [noise(p, 1).to_bits(), fractal(p, 4, 2).to_bits(), cells(p, 3).first.to_bits(), cells(p, 3).id];
+        assert_eq!(bits, FROZEN);
+    }
+
+    const FROZEN: [u32; 4] = [0, 0, 0, 0];
+
+    #[test]
+    fn noise_has_no_bias_and_stays_in_range() {
+        let (mut sum, mut most) = (0.0, 0.0f32);
+        for i in 0..20_000 {
+            let mut dice = Dice::new(i);
+            let value = noise(Vec3::new(dice.signed(), dice.signed(), dice.signed()) * 50.0, 5);
+            sum += f64::from(value);
+            most = most.max(value.abs());
+        }
+        assert!((sum / 20_000.0).abs() < 0.01, "mean {}", sum / 20_000.0);
+        assert!(most <= 1.0 && most > 0.5, "largest {most}");
+    }
+
+    #[test]
+    fn nearest_cell_point_is_nearer_than_the_second() {
+        for i in 0..1000 {
+            let mut dice = Dice::new(i);
+            let cell = cells(Vec3::new(dice.signed(), dice.signed(), dice.signed()) * 9.0, 4);
+            assert!(cell.first <= cell.second && cell.first < 1.8);
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! The four reference poses, from the expression shapes' own displacements where the bones stand.
+
+use super::mesh::Mesh;
+use super::rig::Rig;
+use super::weights::shape;
+use glam::Vec3;
+use rhytid_shared::character::schema::{Drive, Pose};
+use std::collections::BTreeMap;
+
+/// A pose: shapes at a weight (above 1 where the shape is too timid), and the bones it moves by name without `_l`, `_r`.
+pub struct PoseRecipe {
+    /// Name in the file.
+    pub name: &'static str,
+    shapes: &'static [(&'static str, f32)],
+    bones: &'static [&'static str],
+    /// Added by hand, left side; x is outwards. Metres.
+    by_hand: &'static [(&'static str, Vec3)],
+}
+
+/// In the order of the file.
+pub const POSES: [PoseRecipe; 4] = [
+    PoseRecipe {
+        name: "stretch",
+        shapes: &[("browInnerUp", 1.0), ("browOuterUpLeft", 1.0), ("browOuterUpRight", 1.0)],
+        bones: &["brow_inner", "brow_mid", "brow_outer", "brow_tail", "glabella"],
+        by_hand: &[],
+    },
+    PoseRecipe {
+        name: "compress",
+        shapes: &[("browDownLeft", 1.0), ("browDownRight", 1.0), ("noseSneerLeft", 1.0), ("noseSneerRight", 1.0)],
+        bones: &["brow_inner", "brow_mid", "brow_outer", "glabella", "nose_wing"],
+        by_hand: &[],
+    },
+    PoseRecipe {
+        name: "smile",
+        shapes: &[("mouthSmileLeft", 1.0), ("mouthSmileRight", 1.0), ("cheekSquintLeft", 0.8), ("cheekSquintRight", 0.8)],
+        bones: &["lip_corner", "lip_upper_outer", "lip_lower_outer", "cheek", "nasolabial"],
+        by_hand: &[],
+    },
+    PoseRecipe {
+        name: "pucker",
+        shapes: &[("mouthPucker", 1.0), ("mouthShrugLower", 0.6)],
+        bones: &[
+            "lip_corner", "lip_upper_outer", "lip_upper", "lip_upper_mid", "lip_lower_outer", "lip_lower", "lip_lower_mid", "chin",
+        ],
+        by_hand: &[],
+    },
+];
+
+impl PoseRecipe {
+    /// Displacement of every skin bone the pose moves, by the bone's name.
+    pub fn displacements(&self, mesh: &Mesh, rig: &Rig) -> BTreeMap<String, Vec3> {
+        let skin_bones = rig.bones.iter().filter(|bone| matches!(bone.drive, Drive::Skin { .. }));
+        skin_bones
+            .zip(&rig.reaches)
+            .filter_map(|(bone, reach)| {
+                let stem = bone.name.strip_suffix("_l").or(bone.name.strip_suffix("_r")).unwrap_or(&bone.name);
+                self.bones.contains(&stem).then(|| {
+                    let from_shapes: Vec3 = self.shapes.iter().map(|&(name, weight)| mesh.morphs[shape(name)][reach.vertex as usize] * weight).sum();
+                    let mirror = Vec3::new(if bone.name.ends_with("_r") { -1.0 } else { 1.0 }, 1.0, 1.0);
+                    let by_hand: Vec3 = self.by_hand.iter().filter(|(name, _)| *name == stem).map(|&(_, delta)| delta * mirror).sum();
+                    (bone.name.clone(), from_shapes + by_hand)
+                })
+            })
+            .collect()
+    }
+
+    /// The pose as the file has it, without its map.
+    pub fn pose(&self, mesh: &Mesh, rig: &Rig) -> Pose {
+        let displacements = self.displacements(mesh, rig);
+        let rest = |name: &str| rig.bones.iter().find(|bone| bone.name == name).map_or(Vec3::ZERO, |bone| bone.point.into());
+        let bones = displacements.into_iter().map(|(name, delta)| (rest(&name) + delta, name)).map(|(point, name)| (name, point.into()));
+        Pose { name: self.name.to_owned(), bones: bones.collect(), map: None }
+    }
+}
