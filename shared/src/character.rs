@@ -8,5 +8,5 @@ mod glb;
 pub mod schema;
 
 pub use checked::{
-    Bone, Character, CharacterError, Corrective, Drive, GroupDegenerate, LandmarkWeight, Mode, Pose, ShapeDeltas, WrinkleMap,
+    Bone, Character, CharacterError, Corrective, Drive, GroupDegenerate, LandmarkWeight, LidKind, Mode, Pose, ShapeDeltas, Side, WrinkleMap,
 };
