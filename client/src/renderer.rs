@@ -1,16 +1,35 @@
 //! Draws a character with wgpu: no storage buffers, no compute, within WebGL2's limits.
 
+mod background;
 mod camera;
+mod coefficients;
 mod frame;
 mod headless;
+mod layouts;
+mod pipelines;
+mod present;
+mod shadow;
+mod studio;
+mod uniforms;
+mod upload;
 mod view;
 
 pub use camera::Camera;
+pub use coefficients::{bone_major, moves_bone};
 pub use frame::RenderFrame;
 pub use headless::{Headless, RenderError, required_limits};
 pub use view::{BlendError, BlendMode, ViewError, ViewMode};
 
-use crate::asset::CharacterAsset;
+use crate::asset::{CharacterAsset, Palette, Surface};
+use glam::{Affine3A, Vec3};
+use layouts::Layouts;
+use pipelines::{Key, Look, Pipelines};
+use present::{Presenter, Targets};
+use rhytid_shared::Character;
+use rhytid_shared::character::Drive;
+use shadow::Shadow;
+use std::sync::Arc;
+use upload::{CharacterGroup, Primitive, Uploader};
 
 /// What one drawing shows and how; changes nothing in the renderer.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -37,46 +56,100 @@ impl DrawSettings {
 /// Everything of one character on one device.
 #[derive(Debug)]
 pub struct Renderer {
+    character: Arc<Character>,
+    palette: Palette,
+    bounds: Bounds,
+    primitives: Vec<Primitive>,
+    group: CharacterGroup,
+    pipelines: Pipelines,
+    background: wgpu::RenderPipeline,
+    shadow: Shadow,
+    frame_block: wgpu::Buffer,
+    frame_group: wgpu::BindGroup,
+    frame_group_unlit: wgpu::BindGroup,
+    presenter: Presenter,
+    targets: Option<Targets>,
+    static_bytes: u64,
     target_format: wgpu::TextureFormat,
+}
+
+/// Sphere round the neutral character, metres, model space.
+#[derive(Debug, Clone, Copy)]
+struct Bounds {
+    centre: Vec3,
+    radius: f32,
 }
 
 impl Renderer {
     /// Uploads `asset` and builds the pipelines that end in pictures of `target_format` (any 8-bit RGBA or BGRA format,
     /// with or without sRGB encoding).
-    pub fn new(_device: &wgpu::Device, _queue: &wgpu::Queue, _asset: &CharacterAsset, target_format: wgpu::TextureFormat) -> Self {
-        Self { target_format }
+    pub fn new(device: &wgpu::Device, queue: &wgpu::Queue, asset: &CharacterAsset, target_format: wgpu::TextureFormat) -> Self {
+        let layouts = Layouts::new(device);
+        let mut uploader = Uploader { device, queue, bytes: 0 };
+        let primitives: Vec<Primitive> = asset.primitives.iter().map(|primitive| uploader.primitive(&layouts, primitive)).collect();
+        let group = uploader.character(&layouts, asset);
+        let frame_block = uploader.uniform("frame", size_of::<uniforms::Frame>());
+        let shadow = Shadow::new(device, &layouts);
+        let frame_group = device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("frame"),
+            layout: &layouts.frame,
+            entries: &[
+                upload::entry(0, frame_block.as_entire_binding()),
+                upload::entry(1, wgpu::BindingResource::TextureView(&shadow.map)),
+                upload::entry(2, wgpu::BindingResource::Sampler(&shadow.sampler)),
+            ],
+        });
+        let frame_group_unlit = device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("frame without shadow map"),
+            layout: &layouts.frame_unlit,
+            entries: &[upload::entry(0, frame_block.as_entire_binding())],
+        });
+        let parts = primitives.iter().map(|primitive| (primitive.surface, primitive.is_double_sided, primitive.alpha));
+        let pipelines = Pipelines::new(device, &layouts, asset.character.num_poses(), parts);
+        Self {
+            character: Arc::clone(&asset.character),
+            palette: asset.palette.clone(),
+            bounds: Bounds::new(asset),
+            group,
+            pipelines,
+            background: background::pipeline(device),
+            static_bytes: uploader.bytes + shadow.bytes,
+            shadow,
+            frame_block,
+            frame_group,
+            frame_group_unlit,
+            presenter: Presenter::new(device, target_format),
+            targets: None,
+            primitives,
+            target_format,
+        }
     }
 
     /// Records the drawing of `frame` into `target`, which is `size` pixels large and is overwritten.
     ///
+    /// Submit what was recorded before the next call: a frame's uniforms are written to the queue here.
     /// A frame that does not fit the character ([`RenderFrame::fits`]) is drawn as the character at rest.
     #[allow(clippy::too_many_arguments, reason = "the four wgpu handles come with every call of this kind")]
     pub fn draw(
         &mut self,
-        _device: &wgpu::Device,
-        _queue: &wgpu::Queue,
+        device: &wgpu::Device,
+        queue: &wgpu::Queue,
         encoder: &mut wgpu::CommandEncoder,
         target: &wgpu::TextureView,
-        _size: [u32; 2],
-        _settings: &DrawSettings,
-        _frame: &RenderFrame,
+        size: [u32; 2],
+        settings: &DrawSettings,
+        frame: &RenderFrame,
     ) {
-        encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
-            label: Some("clear"),
-            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
-                view: target,
-                depth_slice: None,
-                resolve_target: None,
-                ops: wgpu::Operations {
-                    load: wgpu::LoadOp::Clear(wgpu::Color { r: 0.1, g: 0.1, b: 0.1, a: 1.0 }),
-                    store: wgpu::StoreOp::Store,
-                },
-            })],
-            depth_stencil_attachment: None,
-            timestamp_writes: None,
-            occlusion_query_set: None,
-            multiview_mask: None,
-        });
+        let size = size.map(|side| side.max(1));
+        let targets = match self.targets.take() {
+            Some(targets) if targets.size == size => targets,
+            _ => self.presenter.targets(device, size),
+        };
+        self.write_uniforms(queue, size, settings, frame);
+        self.draw_shadow(encoder);
+        self.draw_scene(encoder, &targets, settings);
+        self.presenter.draw(encoder, &targets, target);
+        self.targets = Some(targets);
     }
 
     /// Format of the pictures.
@@ -84,8 +157,202 @@ impl Renderer {
         self.target_format
     }
 
+    /// The character drawn.
+    pub fn character(&self) -> &Arc<Character> {
+        &self.character
+    }
+
     /// Bytes of buffers and textures this renderer holds on the device.
     pub fn gpu_bytes(&self) -> u64 {
-        0
+        self.static_bytes + self.targets.as_ref().map_or(0, |targets| targets.bytes)
     }
+
+    fn write_uniforms(&self, queue: &wgpu::Queue, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) {
+        let character = &*self.character;
+        let at_rest;
+        let frame = if frame.fits(character) {
+            frame
+        } else {
+            at_rest = RenderFrame::at_rest(character);
+            &at_rest
+        };
+        let rows: Vec<[[f32; 4]; 3]> = self.palette.model_from_rest(character, frame).iter().map(rows_of).collect();
+        queue.write_buffer(&self.group.palette, 0, bytemuck::cast_slice(&rows));
+
+        let (num_bones, num_poses) = (character.num_bones(), character.num_poses());
+        let mut coefficients = bone_major(&frame.influences, num_bones, num_poses);
+        if !settings.wrinkles {
+            coefficients.fill([0.0; 4]);
+        }
+        queue.write_buffer(&self.group.coefficients, 0, bytemuck::cast_slice(&coefficients));
+        queue.write_buffer(&self.frame_block, 0, bytemuck::bytes_of(&self.frame_uniforms(size, settings, frame)));
+
+        let present = uniforms::Present {
+            exposure: settings.exposure,
+            is_display_ready: u32::from(matches!(settings.view, ViewMode::Influence(_) | ViewMode::Normals | ViewMode::Wireframe)),
+            target_encodes_srgb: u32::from(self.presenter.target_encodes_srgb),
+            is_split: u32::from(settings.view == ViewMode::Split),
+        };
+        queue.write_buffer(&self.presenter.block, 0, bytemuck::bytes_of(&present));
+    }
+
+    fn frame_uniforms(&self, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> uniforms::Frame {
+        let character = &*self.character;
+        // The bust stays while the head travels: a sphere that holds both.
+        let travel = frame.head.position;
+        let (centre, radius) = (self.bounds.centre + travel * 0.5, self.bounds.radius + travel.length() * 0.5);
+        let head_from_world = Affine3A::from_rotation_translation(
+            frame.head.rotation,
+            character.head_pivot + travel - frame.head.rotation * character.head_pivot,
+        )
+        .inverse();
+        let marks = &character.ibug68;
+        let inner_lips = (60..68).map(|landmark| marks[landmark]).sum::<Vec3>() / 8.0;
+        let half_mouth = 0.5 * marks[48].distance(marks[54]);
+        let shown = |k: usize| match settings.view {
+            ViewMode::Influence(None) => 1.0,
+            ViewMode::Influence(Some(only)) if only == k => 1.0,
+            _ => 0.0,
+        };
+        let eye = settings.camera.eye();
+        uniforms::Frame {
+            clip_from_world: settings.camera.clip_from_world(size[0] as f32 / size[1] as f32).to_cols_array_2d(),
+            shadow_from_world: studio::shadow_from_world(centre, radius).to_cols_array_2d(),
+            head_from_world: rows_of(&head_from_world),
+            eye: eye.extend(2.0 * radius / shadow::SIDE as f32).to_array(),
+            lights: studio::lights(),
+            sky: Vec3::from(studio::SKY).extend(0.0).to_array(),
+            ground: Vec3::from(studio::GROUND).extend(0.0).to_array(),
+            mouth: inner_lips.extend(half_mouth).to_array(),
+            eyeballs: eyeballs(character),
+            shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
+        }
+    }
+
+    fn draw_shadow(&self, encoder: &mut wgpu::CommandEncoder) {
+        let mut pass = self.shadow.begin(encoder);
+        pass.set_bind_group(0, &self.frame_group_unlit, &[]);
+        pass.set_bind_group(1, &self.group.group, &[]);
+        for primitive in self.primitives.iter().filter(|primitive| !matches!(primitive.surface, Surface::Wet | Surface::Hair)) {
+            pass.set_vertex_buffer(0, primitive.vertices.slice(..));
+            pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
+            pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
+        }
+    }
+
+    fn draw_scene(&self, encoder: &mut wgpu::CommandEncoder, targets: &Targets, settings: &DrawSettings) {
+        let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+            label: Some("scene"),
+            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+                view: &targets.samples,
+                depth_slice: None,
+                resolve_target: Some(&targets.scene),
+                ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color::BLACK), store: wgpu::StoreOp::Discard },
+            })],
+            depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
+                view: &targets.depth,
+                depth_ops: Some(wgpu::Operations { load: wgpu::LoadOp::Clear(1.0), store: wgpu::StoreOp::Discard }),
+                stencil_ops: None,
+            }),
+            timestamp_writes: None,
+            occlusion_query_set: None,
+            multiview_mask: None,
+        });
+        pass.set_pipeline(&self.background);
+        pass.draw(0..3, 0..1);
+        let blend = Look::blend_index(settings.blend);
+        match settings.view {
+            ViewMode::Beauty => self.draw_primitives(&mut pass, Look::Wrinkled(blend)),
+            ViewMode::Bare => self.draw_primitives(&mut pass, Look::Bare),
+            ViewMode::Influence(_) => self.draw_primitives(&mut pass, Look::Influence),
+            ViewMode::Normals => self.draw_primitives(&mut pass, Look::Normals(blend)),
+            ViewMode::Wireframe => self.draw_wireframe(&mut pass),
+            ViewMode::Split => {
+                let [width, height] = targets.size;
+                let middle = width / 2;
+                if middle > 0 {
+                    pass.set_scissor_rect(0, 0, middle, height);
+                    self.draw_primitives(&mut pass, Look::Wrinkled(blend));
+                }
+                pass.set_scissor_rect(middle, 0, width - middle, height);
+                self.draw_primitives(&mut pass, Look::Bare);
+            }
+        }
+    }
+
+    fn draw_primitives(&self, pass: &mut wgpu::RenderPass<'_>, look: Look) {
+        pass.set_bind_group(0, &self.frame_group, &[]);
+        pass.set_bind_group(1, &self.group.group, &[]);
+        let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
+        // What adds to or covers the rest comes last.
+        let rank = |surface: Surface| match surface {
+            Surface::Hair => 1,
+            Surface::Wet => 2,
+            _ => 0,
+        };
+        for at in 0..3 {
+            for primitive in self.primitives.iter().filter(|primitive| rank(primitive.surface) == at) {
+                if primitive.surface == Surface::Wet && !is_lit {
+                    continue;
+                }
+                let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha);
+                let Some(pipeline) = self.pipelines.surface(key) else { continue };
+                pass.set_pipeline(pipeline);
+                pass.set_bind_group(2, &primitive.material, &[]);
+                pass.set_vertex_buffer(0, primitive.vertices.slice(..));
+                pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
+                pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
+            }
+        }
+    }
+
+    fn draw_wireframe(&self, pass: &mut wgpu::RenderPass<'_>) {
+        pass.set_bind_group(0, &self.frame_group_unlit, &[]);
+        pass.set_bind_group(1, &self.group.group, &[]);
+        pass.set_pipeline(&self.pipelines.wire_body);
+        for primitive in &self.primitives {
+            pass.set_vertex_buffer(0, primitive.vertices.slice(..));
+            pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
+            pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
+        }
+        pass.set_pipeline(&self.pipelines.wire_edges);
+        for primitive in &self.primitives {
+            pass.set_vertex_buffer(0, primitive.vertices.slice(..));
+            pass.set_index_buffer(primitive.edges.slice(..), wgpu::IndexFormat::Uint32);
+            pass.draw_indexed(0..primitive.num_edge_indices, 0, 0..1);
+        }
+    }
+}
+
+impl Bounds {
+    fn new(asset: &CharacterAsset) -> Self {
+        let positions =
+            || asset.primitives.iter().flat_map(|primitive| primitive.vertices.iter().map(|vertex| Vec3::from(vertex.position)));
+        let (low, high) =
+            positions().fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), position| (low.min(position), high.max(position)));
+        let centre = (low + high) * 0.5;
+        let radius = positions().map(|position| position.distance(centre)).fold(0.01, f32::max);
+        Self { centre, radius }
+    }
+}
+
+/// Centres and radii of the eyeballs: the pivots of the eye bones, else from the landmarks. Left, then right.
+fn eyeballs(character: &Character) -> [[f32; 4]; 2] {
+    use rhytid_shared::character::Side;
+    // An adult's eyeball measures 24 mm across and the corners of the lids lie 86 mm apart (Farkas 1994).
+    let radius = character.interocular() * 0.14;
+    let centre = |side: Side, corners: [usize; 2]| {
+        let pivot = character.bones.iter().find_map(|bone| match bone.drive {
+            Drive::Eye { eye, pivot, .. } if eye == side => Some(pivot),
+            _ => None,
+        });
+        pivot.unwrap_or_else(|| (character.ibug68[corners[0]] + character.ibug68[corners[1]]) * 0.5 - Vec3::Z * radius * 0.8)
+    };
+    [centre(Side::Left, [42, 45]).extend(radius).to_array(), centre(Side::Right, [36, 39]).extend(radius).to_array()]
+}
+
+/// The three rows of `target_from_source`.
+fn rows_of(transform: &Affine3A) -> [[f32; 4]; 3] {
+    let (m, t) = (transform.matrix3, transform.translation);
+    [0, 1, 2].map(|row| [m.x_axis[row], m.y_axis[row], m.z_axis[row], t[row]])
 }

@@ -1,0 +1,221 @@
+//! Puts a decoded character on the device and counts the bytes.
+
+use super::coefficients::pose_table;
+use super::layouts::Layouts;
+use super::uniforms;
+use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, PrimitiveAsset, Surface, Texels};
+use std::collections::BTreeSet;
+use wgpu::util::DeviceExt;
+
+/// Sides of a texel's footprint that are sampled at most: skin is seen at grazing angles all round its outline.
+const ANISOTROPY: u16 = 8;
+
+/// Creates objects on one device and counts their bytes.
+#[derive(Debug)]
+pub struct Uploader<'a> {
+    pub device: &'a wgpu::Device,
+    pub queue: &'a wgpu::Queue,
+    /// Bytes created so far.
+    pub bytes: u64,
+}
+
+/// A part on the device.
+#[derive(Debug)]
+pub struct Primitive {
+    pub surface: Surface,
+    pub alpha: Alpha,
+    pub is_double_sided: bool,
+    pub vertices: wgpu::Buffer,
+    pub indices: wgpu::Buffer,
+    pub num_indices: u32,
+    /// Each edge once, as pairs of indices.
+    pub edges: wgpu::Buffer,
+    pub num_edge_indices: u32,
+    pub material: wgpu::BindGroup,
+}
+
+/// What of a character changes from frame to frame, and its wrinkle maps: group 1.
+#[derive(Debug)]
+pub struct CharacterGroup {
+    pub palette: wgpu::Buffer,
+    pub coefficients: wgpu::Buffer,
+    pub group: wgpu::BindGroup,
+}
+
+impl Uploader<'_> {
+    pub fn uniform(&mut self, label: &str, size: usize) -> wgpu::Buffer {
+        self.bytes += size as u64;
+        self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(label),
+            size: size as u64,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        })
+    }
+
+    fn filled(&mut self, label: &str, contents: &[u8], usage: wgpu::BufferUsages) -> wgpu::Buffer {
+        self.bytes += contents.len() as u64;
+        self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor { label: Some(label), contents, usage })
+    }
+
+    /// Layers of the same size and kind as one array texture. Levels larger than the device takes are left out.
+    fn texture(&mut self, label: &str, layers: &[&MipChain]) -> wgpu::Texture {
+        let most = self.device.limits().max_texture_dimension_2d;
+        let first = layers[0];
+        let side_at = |level: usize, axis: usize| (first.size[axis] >> level).max(1);
+        let skipped = (0..first.levels.len()).find(|&level| side_at(level, 0).max(side_at(level, 1)) <= most).unwrap_or(0);
+        let texture = self.device.create_texture(&wgpu::TextureDescriptor {
+            label: Some(label),
+            size: wgpu::Extent3d { width: side_at(skipped, 0), height: side_at(skipped, 1), depth_or_array_layers: layers.len() as u32 },
+            mip_level_count: (first.levels.len() - skipped) as u32,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format: match first.texels {
+                Texels::AlbedoSrgb => wgpu::TextureFormat::Rgba8UnormSrgb,
+                Texels::Slopes | Texels::Linear2 => wgpu::TextureFormat::Rg8Unorm,
+            },
+            usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+            view_formats: &[],
+        });
+        for (layer, chain) in layers.iter().enumerate() {
+            for (level, texels) in chain.levels.iter().enumerate().skip(skipped) {
+                let size = wgpu::Extent3d { width: side_at(level, 0), height: side_at(level, 1), depth_or_array_layers: 1 };
+                self.queue.write_texture(
+                    wgpu::TexelCopyTextureInfo {
+                        texture: &texture,
+                        mip_level: (level - skipped) as u32,
+                        origin: wgpu::Origin3d { x: 0, y: 0, z: layer as u32 },
+                        aspect: wgpu::TextureAspect::All,
+                    },
+                    texels,
+                    wgpu::TexelCopyBufferLayout {
+                        offset: 0,
+                        bytes_per_row: Some(size.width * chain.texels.size() as u32),
+                        rows_per_image: None,
+                    },
+                    size,
+                );
+                self.bytes += texels.len() as u64;
+            }
+        }
+        texture
+    }
+
+    /// Wrinkle maps and the uniforms of a frame.
+    pub fn character(&mut self, layouts: &Layouts, asset: &CharacterAsset) -> CharacterGroup {
+        let palette = self.uniform("joint palette", size_of::<uniforms::PaletteRows>());
+        let coefficients = self.uniform("influence coefficients", size_of::<uniforms::CoefficientVectors>());
+        let table = self.filled("pose table", bytemuck::bytes_of(&pose_table(asset)), wgpu::BufferUsages::UNIFORM);
+        let flat = MipChain::uniform([1, 1], Texels::Slopes, &[128, 128]);
+        let layers: Vec<&MipChain> = match &asset.wrinkles {
+            Some(wrinkles) => wrinkles.layers.iter().collect(),
+            None => vec![&flat],
+        };
+        let maps = self.texture("wrinkle maps", &layers);
+        let view =
+            maps.create_view(&wgpu::TextureViewDescriptor { dimension: Some(wgpu::TextureViewDimension::D2Array), ..Default::default() });
+        let sampler = self.map_sampler("wrinkle sampler");
+        let group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("character"),
+            layout: &layouts.character,
+            entries: &[
+                entry(0, palette.as_entire_binding()),
+                entry(1, coefficients.as_entire_binding()),
+                entry(2, table.as_entire_binding()),
+                entry(3, wgpu::BindingResource::TextureView(&view)),
+                entry(4, wgpu::BindingResource::Sampler(&sampler)),
+            ],
+        });
+        CharacterGroup { palette, coefficients, group }
+    }
+
+    /// One part with its material.
+    pub fn primitive(&mut self, layouts: &Layouts, asset: &PrimitiveAsset) -> Primitive {
+        let edges = edges(&asset.indices);
+        let label = |what: &str| format!("{} {what}", asset.name);
+        Primitive {
+            surface: asset.surface,
+            alpha: asset.material.alpha,
+            is_double_sided: asset.material.is_double_sided,
+            vertices: self.filled(&label("vertices"), bytemuck::cast_slice(&asset.vertices), wgpu::BufferUsages::VERTEX),
+            indices: self.filled(&label("triangles"), bytemuck::cast_slice(&asset.indices), wgpu::BufferUsages::INDEX),
+            num_indices: asset.indices.len() as u32,
+            edges: self.filled(&label("edges"), bytemuck::cast_slice(&edges), wgpu::BufferUsages::INDEX),
+            num_edge_indices: edges.len() as u32,
+            material: self.material(layouts, &asset.name, &asset.material),
+        }
+    }
+
+    fn material(&mut self, layouts: &Layouts, name: &str, asset: &MaterialAsset) -> wgpu::BindGroup {
+        let block = uniforms::Material {
+            base_color: asset.base_color,
+            normal_scale: asset.normal_scale,
+            roughness: asset.roughness,
+            occlusion_strength: asset.occlusion_strength,
+            padding: 0,
+        };
+        let label = |what: &str| format!("{name} {what}");
+        let block = self.filled(&label("material"), bytemuck::bytes_of(&block), wgpu::BufferUsages::UNIFORM);
+        let mut view = |what: &str, chain: &Option<MipChain>, texels: Texels, missing: &[u8]| {
+            let texture = match chain {
+                Some(chain) => self.texture(&label(what), &[chain]),
+                None => self.texture(&label(what), &[&MipChain::uniform([1, 1], texels, missing)]),
+            };
+            texture.create_view(&wgpu::TextureViewDescriptor::default())
+        };
+        let albedo = view("albedo", &asset.albedo, Texels::AlbedoSrgb, &[255; 4]);
+        let normal = view("normal", &asset.normal, Texels::Slopes, &[128; 2]);
+        let surface = view("surface", &asset.surface_map, Texels::Linear2, &[255; 2]);
+        let sampler = self.map_sampler(&label("sampler"));
+        self.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some(name),
+            layout: &layouts.material,
+            entries: &[
+                entry(0, block.as_entire_binding()),
+                entry(1, wgpu::BindingResource::TextureView(&albedo)),
+                entry(2, wgpu::BindingResource::TextureView(&normal)),
+                entry(3, wgpu::BindingResource::TextureView(&surface)),
+                entry(4, wgpu::BindingResource::Sampler(&sampler)),
+            ],
+        })
+    }
+
+    fn map_sampler(&self, label: &str) -> wgpu::Sampler {
+        self.device.create_sampler(&wgpu::SamplerDescriptor {
+            label: Some(label),
+            address_mode_u: wgpu::AddressMode::Repeat,
+            address_mode_v: wgpu::AddressMode::Repeat,
+            mag_filter: wgpu::FilterMode::Linear,
+            min_filter: wgpu::FilterMode::Linear,
+            mipmap_filter: wgpu::MipmapFilterMode::Linear,
+            anisotropy_clamp: ANISOTROPY,
+            ..Default::default()
+        })
+    }
+}
+
+/// Shorthand for one entry of a bind group.
+pub fn entry(binding: u32, resource: wgpu::BindingResource<'_>) -> wgpu::BindGroupEntry<'_> {
+    wgpu::BindGroupEntry { binding, resource }
+}
+
+/// Each edge of the triangles once.
+fn edges(indices: &[u32]) -> Vec<u32> {
+    let mut known = BTreeSet::new();
+    for &[a, b, c] in indices.as_chunks::<3>().0 {
+        for (a, b) in [(a, b), (b, c), (c, a)] {
+            known.insert((a.min(b), a.max(b)));
+        }
+    }
+    known.into_iter().flat_map(|(a, b)| [a, b]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_edge_two_triangles_share_is_drawn_once() {
+        assert_eq!(edges(&[0, 1, 2, 2, 1, 3]), [0, 1, 0, 2, 1, 2, 1, 3, 2, 3]);
+    }
+}

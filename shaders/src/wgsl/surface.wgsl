@@ -1,0 +1,108 @@
+// Vertex stage and maps that all parts of the character share.
+//!include frame
+//!include skinning
+//!include wrinkles
+
+struct Material {
+    // Linear RGB and alpha; multiplies the albedo map.
+    base_color: vec4<f32>,
+    // Largest slope of the normal map.
+    normal_scale: f32,
+    // Multiplies the roughness map.
+    roughness: f32,
+    // How much of the occlusion map counts, 0 to 1.
+    occlusion_strength: f32,
+}
+
+@group(1) @binding(3) var wrinkle_maps: texture_2d_array<f32>;
+@group(1) @binding(4) var wrinkle_sampler: sampler;
+
+@group(2) @binding(0) var<uniform> material: Material;
+@group(2) @binding(1) var albedo_map: texture_2d<f32>;
+@group(2) @binding(2) var normal_map: texture_2d<f32>;
+// Red: ambient occlusion. Green: roughness.
+@group(2) @binding(3) var surface_map: texture_2d<f32>;
+@group(2) @binding(4) var map_sampler: sampler;
+
+struct Varyings {
+    @builtin(position) clip: vec4<f32>,
+    @location(0) world: vec3<f32>,
+    // Unit per vertex, not renormalised per fragment: tangent spaces of bakers are read that way.
+    @location(1) normal: vec3<f32>,
+    @location(2) tangent: vec4<f32>,
+    @location(3) uv: vec2<f32>,
+    // Where the vertex is at rest, head space.
+    @location(4) rest: vec3<f32>,
+    @location(5) influences_0_3: vec4<f32>,
+    @location(6) influences_4_7: vec4<f32>,
+}
+
+fn vary(in: VertexIn) -> Varyings {
+    let deformed = deform(in);
+    var out: Varyings;
+    out.clip = frame.clip_from_world * vec4<f32>(deformed.position, 1.0);
+    out.world = deformed.position;
+    out.normal = deformed.normal;
+    out.tangent = vec4<f32>(deformed.tangent, in.tangent.w);
+    out.uv = in.uv;
+    out.rest = in.position;
+    return out;
+}
+
+@vertex
+fn vs_wrinkled(in: VertexIn) -> Varyings {
+    var out = vary(in);
+    out.influences_0_3 = influences(in, 0u);
+    if NUM_POSES > 4u {
+        out.influences_4_7 = influences(in, 1u);
+    }
+    return out;
+}
+
+@vertex
+fn vs_bare(in: VertexIn) -> Varyings {
+    return vary(in);
+}
+
+fn world_from_tangent(in: Varyings, normal: vec3<f32>) -> vec3<f32> {
+    let bitangent = in.tangent.w * cross(in.normal, in.tangent.xyz);
+    return normalize(in.tangent.xyz * normal.x + bitangent * normal.y + in.normal * normal.z);
+}
+
+fn base_slope(uv: vec2<f32>) -> vec2<f32> {
+    return slope_of(textureSample(normal_map, map_sampler, uv).xy, material.normal_scale);
+}
+
+fn bare_normal(in: Varyings) -> vec3<f32> {
+    return world_from_tangent(in, normal_of(base_slope(in.uv)));
+}
+
+fn influence(in: Varyings, pose: u32) -> f32 {
+    if pose < 4u {
+        return in.influences_0_3[pose];
+    }
+    return in.influences_4_7[pose - 4u];
+}
+
+fn wrinkled_normal(in: Varyings) -> vec3<f32> {
+    var blend = begin_blend(base_slope(in.uv));
+    for (var pose = 0u; pose < NUM_POSES; pose += 1u) {
+        let map = slope_of(textureSample(wrinkle_maps, wrinkle_sampler, in.uv, pose).xy, pose_table.scales[pose / 4u][pose % 4u]);
+        blend = add_wrinkle(blend, map, pose_table.contains_neutral[pose / 4u][pose % 4u], influence(in, pose));
+    }
+    return world_from_tangent(in, end_blend(blend));
+}
+
+fn albedo_of(uv: vec2<f32>) -> vec4<f32> {
+    return textureSample(albedo_map, map_sampler, uv) * material.base_color;
+}
+
+struct Finish {
+    occlusion: f32,
+    roughness: f32,
+}
+
+fn finish_of(uv: vec2<f32>) -> Finish {
+    let texel = textureSample(surface_map, map_sampler, uv);
+    return Finish(mix(1.0, texel.x, material.occlusion_strength), material.roughness * texel.y);
+}
