@@ -1,26 +1,45 @@
 //! The solve: what a tracker saw in, a solved face out. Pure functions of their input: no clock, no I/O, and the same
 //! bits on every machine (sums in a fixed order, no fused multiply-add, `libm` for transcendental functions).
+//!
+//! One direction: landmarks → head pose removed → smoothed → regression (or expression weights → linear deltas and
+//! correctives, or an animator's own bones) → each bone's motion → eased over lost faces and new neutrals → evaluated
+//! points, rotations and influences.
 
+mod calibration;
 mod config;
+mod easing;
 mod error;
+mod evaluate;
+mod filter;
+mod gaze;
+mod head_pose;
+mod ingest;
+mod landmark_session;
+mod landmarks_to_bones;
+mod lids;
+mod linear;
+mod points;
+mod rbf;
+mod rotation;
+mod skeleton;
+mod weight_session;
+mod weights_to_bones;
 
+pub use calibration::Calibration;
 pub use config::{CalibrationConfig, ConfigError, FilterConfig, LostConfig, OneEuroConfig, SolveConfig};
 pub use error::SolveError;
 
-use rhytid_shared::{Character, FaceFrame, PublishHello, TrackingFrame};
-use serde::{Deserialize, Serialize};
+use easing::{Easing, FaceState};
+use evaluate::Evaluator;
+use landmark_session::LandmarkSession;
+use rhytid_shared::{Character, FaceFrame, HeadPose, PublishHello, TrackingData, TrackingFrame};
+use serde::Serialize;
+use skeleton::Skeleton;
 use std::sync::Arc;
+use weight_session::{SentHead, WeightSession};
 
-/// A neutral face as it was calibrated: kept with a session so that a replay is exact.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Calibration {
-    /// Sender's time at which it was reached, seconds.
-    pub t: f64,
-    /// Frames it is the median of.
-    pub num_frames: usize,
-    /// The performer's neutral points in head space, metres at the character's scale, in the order of the solve's points.
-    pub neutral: Vec<[f64; 3]>,
-}
+/// No sender's clock is beyond this, seconds: three hundred years, and microseconds of it still fit an `f64`.
+const LATEST: f64 = 9e9;
 
 /// What a publisher is told when a neutral has been reached.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -29,7 +48,7 @@ pub struct CalibrationReport {
     pub t: f64,
     /// Frames it is the median of.
     pub num_frames: usize,
-    /// Root-mean-square landmark speed over those frames, interocular distances a second.
+    /// Root-mean-square landmark speed over those frames, interocular distances a second; 0 for senders of weights.
     pub speed: f64,
     /// True where the publisher asked for it.
     pub requested: bool,
@@ -52,16 +71,60 @@ pub struct DelayReport {
 pub struct Solver {
     character: Arc<Character>,
     config: SolveConfig,
-    calibration: Option<Calibration>,
+    landmarks: Option<LandmarkSession>,
+    weights: WeightSession,
+    sent_head: SentHead,
+    skeleton: Skeleton,
+    evaluator: Evaluator,
+    easing: Easing,
+    /// The face as this frame alone would have it.
+    target: FaceState,
+    last_t: Option<f64>,
+    last_source: Option<Source>,
+    /// A neutral of weights, or one the publisher gave.
+    sent_calibration: Option<Calibration>,
+    /// The publisher asked for a neutral before there was a frame to take it from.
+    is_wanted: bool,
+    /// The next face is blended in: its neutral is another.
+    blend: Option<f64>,
     report: Option<CalibrationReport>,
     seq: u32,
 }
 
+/// What a frame's bones came from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Source {
+    Landmarks,
+    Weights,
+    Bones,
+}
+
 impl Solver {
     /// Starts a session. Fails where the settings, the layout or the camera make no sense.
-    pub fn new(character: Arc<Character>, config: &SolveConfig, _hello: &PublishHello) -> Result<Self, SolveError> {
+    pub fn new(character: Arc<Character>, config: &SolveConfig, hello: &PublishHello) -> Result<Self, SolveError> {
         config.validate()?;
-        Ok(Self { character, config: config.clone(), calibration: None, report: None, seq: 0 })
+        let landmarks = match &hello.layout {
+            Some(layout) => Some(LandmarkSession::new(&character, config, layout, hello)?),
+            None => None,
+        };
+        Ok(Self {
+            landmarks,
+            weights: WeightSession::new(&character, config),
+            sent_head: SentHead::new(config.mirror),
+            skeleton: Skeleton::new(&character),
+            evaluator: Evaluator::new(&character),
+            easing: Easing::new(&config.lost, character.num_bones()),
+            target: FaceState::at_rest(character.num_bones()),
+            last_t: None,
+            last_source: None,
+            sent_calibration: None,
+            is_wanted: false,
+            blend: None,
+            report: None,
+            seq: 0,
+            config: config.clone(),
+            character,
+        })
     }
 
     /// As [`Self::new`], with a neutral from an earlier session in place of the search for one.
@@ -72,38 +135,160 @@ impl Solver {
         calibration: Calibration,
     ) -> Result<Self, SolveError> {
         let mut solver = Self::new(character, config, hello)?;
-        solver.calibration = Some(calibration);
+        let num_points = solver.landmarks.as_ref().map_or(0, LandmarkSession::num_points);
+        if let Some(problem) = calibration.problem(num_points) {
+            return Err(SolveError::BadCalibration { problem });
+        }
+        match &mut solver.landmarks {
+            Some(landmarks) => landmarks.restore(&solver.character, calibration)?,
+            None => {
+                solver.sent_head.restore(&calibration);
+                solver.weights.restore(calibration.weights.as_deref().unwrap_or(&[]));
+                solver.sent_calibration = Some(calibration);
+            }
+        }
         Ok(solver)
     }
 
-    /// Takes the neutral now: the face of the last frames (or, before any, of the first ones to come) is the neutral.
-    pub fn calibrate(&mut self) {}
+    /// Takes the neutral now: the face of the last moments or, before any face, of the first ones to come.
+    pub fn calibrate(&mut self) {
+        let landmarks = match self.last_source {
+            Some(Source::Landmarks) | None => self.landmarks.as_mut(),
+            Some(Source::Weights | Source::Bones) => None,
+        };
+        if let Some(landmarks) = landmarks {
+            if landmarks.calibrate(&self.character, self.last_t) {
+                self.blend = Some(self.config.calibration.blend);
+                self.report = landmarks.calibration().map(report_of);
+            }
+            return;
+        }
+        self.is_wanted = true;
+        if let (Some(t), Some(_)) = (self.last_t, self.last_source) {
+            self.calibrate_sent(t);
+        }
+    }
+
+    /// Takes the last weights and head as neutral.
+    fn calibrate_sent(&mut self, t: f64) {
+        let (rotation, position) = self.sent_head.calibrate();
+        let weights = if self.last_source == Some(Source::Weights) { self.weights.calibrate() } else { None };
+        let calibration = Calibration::of_weights(t, weights, rotation, position);
+        self.report = Some(report_of(&calibration));
+        self.sent_calibration = Some(calibration);
+        self.blend = Some(self.config.calibration.blend);
+        self.is_wanted = false;
+    }
 
     /// Solves one frame into `out`, whose buffers are reused; `session` is left to the caller, `seq` counts solved frames.
-    /// On an error `out` is as before and the frame counts for nothing.
+    /// On an error `out` and the session are as before: the frame counts for nothing.
     pub fn solve(&mut self, frame: &TrackingFrame, out: &mut FaceFrame) -> Result<(), SolveError> {
-        let session = out.session;
-        *out = FaceFrame::at_rest(&self.character);
-        out.session = session;
+        let t = frame.t;
+        if !(0.0..=LATEST).contains(&t) {
+            return Err(SolveError::TimeRange { got: t });
+        }
+        if let Some(previous) = self.last_t.filter(|previous| t <= *previous) {
+            return Err(SolveError::Time { got: t, previous });
+        }
+        let source = self.aim(t, &frame.data)?;
+        self.last_t = Some(t);
+        out.face = source.is_some();
+        match source {
+            Some(source) => {
+                self.last_source = Some(source);
+                self.easing.show(t, &self.target, self.blend.take());
+                if self.is_wanted && source != Source::Landmarks {
+                    self.calibrate_sent(t);
+                }
+            }
+            None => {
+                if let Some(landmarks) = &mut self.landmarks {
+                    landmarks.interrupt();
+                }
+                self.easing.show_none(t);
+            }
+        }
         out.seq = self.seq;
-        out.captured_at_micros = (frame.t * 1e6) as u64;
-        self.seq += 1;
-        let _ = &self.config;
+        self.seq = self.seq.wrapping_add(1);
+        out.captured_at_micros = libm::round(t * 1e6) as u64;
+        self.write(out);
         Ok(())
+    }
+
+    /// Computes the target of one frame; nothing where there is no face.
+    fn aim(&mut self, t: f64, data: &TrackingData) -> Result<Option<Source>, SolveError> {
+        match data {
+            TrackingData::NoFace => Ok(None),
+            TrackingData::Landmarks { points, confidence } => {
+                let landmarks = self.landmarks.as_mut().ok_or(SolveError::NoLayout)?;
+                let solved = landmarks.solve(&self.character, t, points, confidence, &mut self.target)?;
+                if solved.is_new_neutral {
+                    self.blend = Some(self.config.calibration.blend);
+                }
+                if solved.is_to_report {
+                    self.report = landmarks.calibration().map(report_of);
+                }
+                Ok(Some(Source::Landmarks))
+            }
+            TrackingData::Weights { weights, head } => {
+                SentHead::check(head.as_ref())?;
+                self.weights.solve(t, weights, &mut self.target)?;
+                self.sent_head.write(head.as_ref(), &mut self.target);
+                Ok(Some(Source::Weights))
+            }
+            TrackingData::Bones { points, head } => {
+                SentHead::check(head.as_ref())?;
+                self.skeleton.check_placed(points)?;
+                self.skeleton.read_placed(points, &mut self.target);
+                self.sent_head.write(head.as_ref(), &mut self.target);
+                Ok(Some(Source::Bones))
+            }
+        }
+    }
+
+    /// Writes what is shown.
+    fn write(&self, out: &mut FaceFrame) {
+        let shown = self.easing.shown();
+        let num_bones = self.character.num_bones();
+        out.points.resize(num_bones, glam::Vec3::ZERO);
+        out.rotations.resize(num_bones, glam::Quat::IDENTITY);
+        out.influences.resize(self.character.num_poses() * num_bones, 0.0);
+        self.skeleton.pose(shown, &mut out.points, &mut out.rotations);
+        self.evaluator.evaluate(&out.points, &mut out.influences);
+        out.zones.clear();
+        out.shapes = shown.weights;
+        let [x, y, z, right, up, front] = shown.head;
+        out.head = HeadPose {
+            rotation: rotation::to_f32(rotation::from_vector(glam::DVec3::new(x, y, z))),
+            position: glam::DVec3::new(right, up, front).as_vec3(),
+        };
     }
 
     /// The neutral in use, once one has been reached.
     pub fn calibration(&self) -> Option<&Calibration> {
-        self.calibration.as_ref()
+        let of_landmarks = self.landmarks.as_ref().and_then(LandmarkSession::calibration);
+        match self.last_source {
+            Some(Source::Weights | Source::Bones) => self.sent_calibration.as_ref(),
+            Some(Source::Landmarks) => of_landmarks,
+            None => of_landmarks.or(self.sent_calibration.as_ref()),
+        }
     }
 
-    /// A calibration reached since the last call.
+    /// A calibration reached since the last call. Later refinements of the same search are not told.
     pub fn take_calibrated(&mut self) -> Option<CalibrationReport> {
         self.report.take()
     }
 
-    /// Delay the smoothing adds at present.
+    /// Delay the smoothing adds at present; zero for senders of weights or bones.
     pub fn added_delay(&self) -> DelayReport {
-        DelayReport::default()
+        match (&self.landmarks, self.last_source) {
+            (Some(landmarks), Some(Source::Landmarks) | None) => landmarks.added_delay(),
+            _ => DelayReport::default(),
+        }
     }
+}
+
+fn report_of(calibration: &Calibration) -> CalibrationReport {
+    let Calibration { t, num_frames, speed, requested, .. } = *calibration;
+    CalibrationReport { t, num_frames, speed, requested }
 }

@@ -20,8 +20,8 @@ pub struct SolveConfig {
     pub lost: LostConfig,
 }
 
-/// One-Euro parameters by group. Speeds are interocular distances a second for landmarks, radians or metres a second for
-/// the head.
+/// One-Euro parameters by group. Speeds are interocular distances a second for landmarks, radians or decimetres a second
+/// for the head.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FilterConfig {
@@ -33,6 +33,8 @@ pub struct FilterConfig {
     pub mouth: OneEuroConfig,
     /// Head rotation and position.
     pub head: OneEuroConfig,
+    /// Expression weights, for senders of those; speed in weights a second.
+    pub weights: OneEuroConfig,
 }
 
 /// One-Euro filter: cut-off = `min_cutoff + beta * |speed|`.
@@ -92,7 +94,13 @@ impl Default for FilterConfig {
     fn default() -> Self {
         let one_euro = |min_cutoff, beta| OneEuroConfig { min_cutoff, beta, derivative_cutoff: 1.0 };
         // Tuned on recorded sessions of a webcam tracker at 24 to 30 frames a second.
-        Self { brows: one_euro(2.0, 8.0), eyelids: one_euro(8.0, 30.0), mouth: one_euro(3.0, 10.0), head: one_euro(1.5, 3.0) }
+        Self {
+            brows: one_euro(2.0, 8.0),
+            eyelids: one_euro(8.0, 30.0),
+            mouth: one_euro(3.0, 10.0),
+            head: one_euro(1.5, 3.0),
+            weights: one_euro(4.0, 5.0),
+        }
     }
 }
 
@@ -125,8 +133,8 @@ impl SolveConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         in_range("ridge", self.ridge, 0.0, 0.1, "0 to 0.1")?;
         in_range("max_reprojection", self.max_reprojection, 1e-3, 1.0, "0.001 to 1")?;
-        let FilterConfig { brows, eyelids, mouth, head } = &self.filter;
-        for (group, one_euro) in [("brows", brows), ("eyelids", eyelids), ("mouth", mouth), ("head", head)] {
+        let FilterConfig { brows, eyelids, mouth, head, weights } = &self.filter;
+        for (group, one_euro) in [("brows", brows), ("eyelids", eyelids), ("mouth", mouth), ("head", head), ("weights", weights)] {
             in_range(&format!("filter.{group}.min_cutoff"), one_euro.min_cutoff, 0.01, 1e3, "0.01 to 1000 Hz")?;
             in_range(&format!("filter.{group}.beta"), one_euro.beta, 0.0, 1e4, "0 to 10000")?;
             in_range(&format!("filter.{group}.derivative_cutoff"), one_euro.derivative_cutoff, 0.01, 1e3, "0.01 to 1000 Hz")?;
@@ -137,7 +145,11 @@ impl SolveConfig {
         in_range("calibration.blend", calibration.blend, 0.0, 10.0, "0 to 10 s")?;
         in_range("calibration.look_back", calibration.look_back, 0.0, 5.0, "0 to 5 s")?;
         if !(1..=1000).contains(&calibration.min_frames) {
-            return Err(ConfigError { field: "calibration.min_frames".into(), got: calibration.min_frames.to_string(), expected: "1 to 1000" });
+            return Err(ConfigError {
+                field: "calibration.min_frames".into(),
+                got: calibration.min_frames.to_string(),
+                expected: "1 to 1000",
+            });
         }
         in_range("lost.hold", self.lost.hold, 0.0, 60.0, "0 to 60 s")?;
         in_range("lost.ease", self.lost.ease, 0.0, 60.0, "0 to 60 s")?;

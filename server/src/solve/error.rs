@@ -54,9 +54,9 @@ pub enum SolveError {
         /// The previous accepted frame's.
         previous: f64,
     },
-    /// Time is no number.
-    #[error("t is {got}, expected finite seconds")]
-    TimeNotFinite {
+    /// Time is no number, or none that a clock could show.
+    #[error("t is {got}, expected seconds from 0 to 9e9")]
+    TimeRange {
         /// The frame's time.
         got: f64,
     },
@@ -79,7 +79,7 @@ pub enum SolveError {
     /// A value that is not finite or far outside anything a tracker gives.
     #[error("{field}[{index}] is {got}, expected finite and {expected}")]
     Value {
-        /// `landmarks`, `confidence`, `weights`, `bones` or `head`.
+        /// `landmarks`, `confidence`, `weights`, `bones`, `head.rotation` or `head.position`.
         field: &'static str,
         /// Index of the point, shape or bone.
         index: usize,
@@ -87,6 +87,14 @@ pub enum SolveError {
         got: f32,
         /// The range.
         expected: &'static str,
+    },
+    /// A bone the character does not have.
+    #[error("bones names bone {got}, but the character has {num_bones}")]
+    BoneIndex {
+        /// Its index.
+        got: usize,
+        /// Bones of the character.
+        num_bones: usize,
     },
     /// The points do not span a face (all in one place, or on one line).
     #[error("landmarks do not span a face: {problem}")]

@@ -1,0 +1,233 @@
+//! Pose evaluation: how strongly each reference pose shows at each bone ([D09] 5.1 and 5.2).
+//!
+//! For bone `i` and pose `k`, with `R` rest, `P` reference and `J` the bone now, all in head space: `u = P - R`,
+//! `d = J - R`, influence = `clamp(dot(d, u) / dot(u, u), 0, 1)`. The printed formula divides by `|u|`, which would give
+//! it the unit of a length; the orthogonal projection the text speaks of needs the square. Groups average what has been
+//! clamped.
+
+use super::linear::solve_positive;
+use glam::Vec3;
+use rhytid_shared::Character;
+use rhytid_shared::character::{GroupDegenerate, Mode};
+use rhytid_shared::limits::MAX_POSES;
+
+/// A segment shorter than this fraction of the interocular distance moves nothing.
+const DEGENERATE: f32 = 1e-5;
+/// Below this fraction of the product of squared lengths two segments count as parallel.
+const PARALLEL: f64 = 1e-6;
+
+/// What of a character the evaluation needs.
+#[derive(Debug, Clone)]
+pub(super) struct Evaluator {
+    num_bones: usize,
+    num_poses: usize,
+    rest: Vec<Vec3>,
+    /// `u / dot(u, u)`, pose-major, zero where degenerate.
+    scaled_segments: Vec<Vec3>,
+    /// `u`, pose-major, zero where degenerate.
+    segments: Vec<Vec3>,
+    groups: Vec<Vec<usize>>,
+    mode: Mode,
+    group_degenerate: GroupDegenerate,
+}
+
+impl Evaluator {
+    pub(super) fn new(character: &Character) -> Self {
+        let shortest = DEGENERATE * character.interocular();
+        let rest: Vec<Vec3> = character.bones.iter().map(|bone| bone.rest).collect();
+        let mut segments = Vec::with_capacity(character.num_poses() * rest.len());
+        for pose in &character.poses {
+            segments.extend(pose.points.iter().zip(&rest).map(|(reference, rest)| {
+                let u = *reference - *rest;
+                if u.length_squared() <= shortest * shortest { Vec3::ZERO } else { u }
+            }));
+        }
+        let scaled_segments = segments.iter().map(|u| if *u == Vec3::ZERO { Vec3::ZERO } else { *u / u.length_squared() }).collect();
+        Self {
+            num_bones: rest.len(),
+            num_poses: character.num_poses(),
+            rest,
+            scaled_segments,
+            segments,
+            groups: character.groups.clone(),
+            mode: character.mode,
+            group_degenerate: character.group_degenerate,
+        }
+    }
+
+    /// Writes the influences at `points`, pose-major. A point that is not finite keeps the coefficients it had.
+    pub(super) fn evaluate(&self, points: &[Vec3], influences: &mut [f32]) {
+        match self.mode {
+            Mode::Independent => self.project_each(points, influences),
+            Mode::Joint => self.project_jointly(points, influences),
+        }
+        self.average_groups(influences);
+    }
+
+    fn is_degenerate(&self, pose: usize, bone: usize) -> bool {
+        self.segments[pose * self.num_bones + bone] == Vec3::ZERO
+    }
+
+    fn project_each(&self, points: &[Vec3], influences: &mut [f32]) {
+        for k in 0..self.num_poses {
+            let row = k * self.num_bones;
+            for i in 0..self.num_bones {
+                let along = (points[i] - self.rest[i]).dot(self.scaled_segments[row + i]);
+                if along.is_finite() {
+                    influences[row + i] = along.clamp(0.0, 1.0);
+                }
+            }
+        }
+    }
+
+    /// Non-negative least squares of the displacement on all the bone's segments, so that poses whose segments are not
+    /// orthogonal do not count the same motion twice.
+    fn project_jointly(&self, points: &[Vec3], influences: &mut [f32]) {
+        for i in 0..self.num_bones {
+            let d = (points[i] - self.rest[i]).as_dvec3();
+            if !d.is_finite() {
+                continue;
+            }
+            let mut poses = [0; MAX_POSES];
+            let mut num = 0;
+            for k in 0..self.num_poses {
+                influences[k * self.num_bones + i] = 0.0;
+                if !self.is_degenerate(k, i) {
+                    poses[num] = k;
+                    num += 1;
+                }
+            }
+            let mut gram = [[0.0; MAX_POSES]; MAX_POSES];
+            let mut along = [0.0; MAX_POSES];
+            for a in 0..num {
+                let u = self.segments[poses[a] * self.num_bones + i].as_dvec3();
+                along[a] = u.dot(d);
+                for b in 0..num {
+                    gram[a][b] = u.dot(self.segments[poses[b] * self.num_bones + i].as_dvec3());
+                }
+            }
+            let shares = match num {
+                2 => two_shares(gram[0][0], gram[0][1], gram[1][1], along[0], along[1]),
+                _ => non_negative_least_squares(&gram, &along, num),
+            };
+            for a in 0..num {
+                influences[poses[a] * self.num_bones + i] = (shares[a] as f32).clamp(0.0, 1.0);
+            }
+        }
+    }
+
+    fn average_groups(&self, influences: &mut [f32]) {
+        for k in 0..self.num_poses {
+            let row = &mut influences[k * self.num_bones..(k + 1) * self.num_bones];
+            for group in &self.groups {
+                let (mut sum, mut count) = (0.0_f32, 0_usize);
+                for &i in group {
+                    let counts = match self.group_degenerate {
+                        GroupDegenerate::Exclude => self.segments[k * self.num_bones + i] != Vec3::ZERO,
+                        GroupDegenerate::Zero => true,
+                    };
+                    if counts {
+                        sum += row[i];
+                        count += 1;
+                    }
+                }
+                let mean = if count == 0 { 0.0 } else { sum / count as f32 };
+                for &i in group {
+                    row[i] = mean;
+                }
+            }
+        }
+    }
+}
+
+/// Closed form for two segments.
+fn two_shares(g11: f64, g12: f64, g22: f64, c1: f64, c2: f64) -> [f64; MAX_POSES] {
+    let mut shares = [0.0; MAX_POSES];
+    let (alone1, alone2) = ((c1 / g11).max(0.0), (c2 / g22).max(0.0));
+    let det = g11 * g22 - g12 * g12;
+    let (a1, a2) = if det < PARALLEL * g11 * g22 {
+        (alone1, alone2)
+    } else {
+        let (a1, a2) = ((g22 * c1 - g12 * c2) / det, (g11 * c2 - g12 * c1) / det);
+        if a1 >= 0.0 && a2 >= 0.0 {
+            (a1, a2)
+        } else if alone1 * c1 >= alone2 * c2 {
+            (alone1, 0.0)
+        } else {
+            (0.0, alone2)
+        }
+    };
+    shares[0] = a1;
+    shares[1] = a2;
+    shares
+}
+
+/// Lawson and Hanson's active-set method on the normal equations of `num` segments. Segments that depend on those
+/// already chosen (more than three always do) are passed over.
+fn non_negative_least_squares(gram: &[[f64; MAX_POSES]; MAX_POSES], along: &[f64; MAX_POSES], num: usize) -> [f64; MAX_POSES] {
+    let mut shares = [0.0; MAX_POSES];
+    let mut is_chosen = [false; MAX_POSES];
+    let mut is_barred = [false; MAX_POSES];
+    // Each round adds a segment or bars one; more rounds than this cannot be useful with eight.
+    for _ in 0..3 * MAX_POSES {
+        let mut best: Option<(usize, f64)> = None;
+        for a in (0..num).filter(|&a| !is_chosen[a] && !is_barred[a]) {
+            let gradient = (0..num).fold(along[a], |sum, b| sum - gram[a][b] * shares[b]);
+            if gradient > 1e-9 * gram[a][a] && best.is_none_or(|(_, most)| gradient > most) {
+                best = Some((a, gradient));
+            }
+        }
+        let Some((entering, _)) = best else { break };
+        is_chosen[entering] = true;
+        loop {
+            let Some(trial) = solve_chosen(gram, along, &is_chosen, num) else {
+                is_chosen[entering] = false;
+                is_barred[entering] = true;
+                break;
+            };
+            // The farthest step towards the trial that keeps every share at or above zero.
+            let mut step = 1.0_f64;
+            for a in (0..num).filter(|&a| is_chosen[a] && trial[a] <= 0.0) {
+                step = step.min(shares[a] / (shares[a] - trial[a]));
+            }
+            for a in 0..num {
+                if is_chosen[a] {
+                    shares[a] += step * (trial[a] - shares[a]);
+                    if trial[a] <= 0.0 && shares[a] <= 1e-12 {
+                        shares[a] = 0.0;
+                        is_chosen[a] = false;
+                    }
+                }
+            }
+            if step >= 1.0 || !is_chosen.contains(&true) {
+                break;
+            }
+        }
+    }
+    shares
+}
+
+/// Least squares on the chosen segments alone; `None` where they depend on each other.
+fn solve_chosen(
+    gram: &[[f64; MAX_POSES]; MAX_POSES],
+    along: &[f64; MAX_POSES],
+    is_chosen: &[bool; MAX_POSES],
+    num: usize,
+) -> Option<[f64; MAX_POSES]> {
+    let (mut a, mut b) = ([[0.0; MAX_POSES]; MAX_POSES], [0.0; MAX_POSES]);
+    for row in 0..MAX_POSES {
+        if row < num && is_chosen[row] {
+            for column in 0..num {
+                if is_chosen[column] {
+                    a[row][column] = gram[row][column];
+                }
+            }
+            b[row] = along[row];
+        } else {
+            a[row][row] = 1.0;
+        }
+    }
+    let factored_is_regular = solve_positive(&mut a, &mut b);
+    let is_independent = (0..num).all(|row| !is_chosen[row] || a[row][row] * a[row][row] > PARALLEL * gram[row][row]);
+    (factored_is_regular && is_independent).then_some(b)
+}

@@ -1,0 +1,284 @@
+//! One performer's landmarks through a session: head pose, neutral, smoothing, retargeting.
+
+use super::DelayReport;
+use super::calibration::{Calibration, Calibrator, ibug_strain};
+use super::config::SolveConfig;
+use super::easing::FaceState;
+use super::error::SolveError;
+use super::filter::{LONGEST_GAP, OneEuroBank};
+use super::head_pose::{self, Fit, Pose};
+use super::ingest::{Camera, Observation};
+use super::landmarks_to_bones::Retarget;
+use super::points::{Group, LEFT_EYE, PointSet, RIGHT_EYE};
+use super::rotation;
+use glam::{DQuat, DVec2, DVec3};
+use rhytid_shared::layout::Layout;
+use rhytid_shared::limits::MAX_HEAD_TRAVEL;
+use rhytid_shared::{Character, PublishHello};
+
+/// A head pose that fits badly is refused for this long, seconds; what lasts longer is no outlier.
+const LONGEST_REFUSAL: f64 = 0.5;
+/// Metres that weigh as much as a radian in the head's filter: the radius of a head.
+const HEAD_RADIUS: f64 = 0.1;
+
+/// Points that share a filter's parameters.
+struct GroupFilter {
+    points: Vec<usize>,
+    samples: Vec<f64>,
+    bank: OneEuroBank,
+}
+
+pub(super) struct LandmarkSession {
+    layout: Layout,
+    camera: Camera,
+    points: PointSet,
+    config: SolveConfig,
+    /// The character's head pivot and interocular distance, metres.
+    pivot: DVec3,
+    unit: f64,
+    observation: Observation,
+    /// The performer's head: x and y of the neutral points, the character's depth; irises after the points.
+    model: Vec<DVec3>,
+    /// Points that place the head in this frame.
+    placing: Vec<(usize, f64)>,
+    pose: Option<Pose>,
+    last_t: Option<f64>,
+    refused_since: Option<f64>,
+    /// In head space, before and after smoothing.
+    lifted: Vec<DVec2>,
+    smoothed: Vec<DVec2>,
+    brows: GroupFilter,
+    eyelids: GroupFilter,
+    mouth: GroupFilter,
+    head: OneEuroBank,
+    calibrator: Calibrator,
+    calibration: Option<Calibration>,
+    retarget: Option<Retarget>,
+}
+
+/// What a frame did besides its face.
+pub(super) struct Solved {
+    /// A neutral came into use with this frame; the face is to be blended over.
+    pub(super) is_new_neutral: bool,
+    /// That neutral is one the publisher waits for.
+    pub(super) is_to_report: bool,
+}
+
+impl LandmarkSession {
+    pub(super) fn new(character: &Character, config: &SolveConfig, layout: &Layout, hello: &PublishHello) -> Result<Self, SolveError> {
+        let camera = Camera::new(hello, config.mirror)?;
+        let points = PointSet::new(character, layout, config.mirror)?;
+        let unit = f64::from(character.interocular());
+        let mut model = points.model.clone();
+        let mut groups = points.groups.clone();
+        if points.irises.is_some() {
+            for eye in [RIGHT_EYE, LEFT_EYE] {
+                model.push((points.model[eye.corners.0] + points.model[eye.corners.1]) * 0.5);
+                groups.push(Group::Eyelids);
+            }
+        }
+        let num = model.len();
+        let group_filter = |group, one_euro| {
+            let points: Vec<usize> = (0..num).filter(|&i| groups[i] == group).collect();
+            let len = 2 * points.len();
+            GroupFilter { points, samples: vec![0.0; len], bank: OneEuroBank::new(one_euro, len, unit) }
+        };
+        Ok(Self {
+            layout: layout.clone(),
+            camera,
+            config: config.clone(),
+            pivot: character.head_pivot.as_dvec3(),
+            unit,
+            observation: Observation { rays: Vec::with_capacity(num), is_sure: Vec::with_capacity(num) },
+            placing: Vec::with_capacity(points.len()),
+            pose: None,
+            last_t: None,
+            refused_since: None,
+            lifted: vec![DVec2::ZERO; num],
+            smoothed: vec![DVec2::ZERO; num],
+            brows: group_filter(Group::Brows, config.filter.brows),
+            eyelids: group_filter(Group::Eyelids, config.filter.eyelids),
+            mouth: group_filter(Group::Mouth, config.filter.mouth),
+            head: OneEuroBank::new(config.filter.head, 6, 1.0),
+            calibrator: Calibrator::new(&config.calibration, num, unit, points.is_ibug.then_some(ibug_strain)),
+            calibration: None,
+            retarget: None,
+            model,
+            points,
+        })
+    }
+
+    /// Uses a neutral from elsewhere and searches for none.
+    pub(super) fn restore(&mut self, character: &Character, calibration: Calibration) -> Result<(), SolveError> {
+        if calibration.points.is_empty() {
+            return Err(SolveError::BadCalibration { problem: "has no points, expected a neutral of landmarks".to_owned() });
+        }
+        self.calibrator.stop();
+        self.adopt(character, calibration)
+    }
+
+    pub(super) fn num_points(&self) -> usize {
+        self.model.len()
+    }
+
+    pub(super) fn calibration(&self) -> Option<&Calibration> {
+        self.calibration.as_ref().filter(|calibration| calibration.num_frames > 0)
+    }
+
+    /// Asks for the neutral now; true where it is in use already.
+    pub(super) fn calibrate(&mut self, character: &Character, t: Option<f64>) -> bool {
+        let Some(found) = self.calibrator.request(t.unwrap_or(f64::NEG_INFINITY)) else { return false };
+        // A face that spans no plane is no neutral: the one in use stays.
+        self.adopt(character, found).is_ok()
+    }
+
+    /// The tracker lost the face.
+    pub(super) fn interrupt(&mut self) {
+        self.calibrator.interrupt();
+    }
+
+    pub(super) fn added_delay(&self) -> DelayReport {
+        DelayReport {
+            brows: self.brows.bank.delay(),
+            eyelids: self.eyelids.bank.delay(),
+            mouth: self.mouth.bank.delay(),
+            head: self.head.delay(),
+        }
+    }
+
+    /// Solves one frame into `state`. An error leaves the session as it was.
+    pub(super) fn solve(
+        &mut self,
+        character: &Character,
+        t: f64,
+        landmarks: &[[f32; 3]],
+        confidence: &[f32],
+        state: &mut FaceState,
+    ) -> Result<Solved, SolveError> {
+        self.camera.observe(&self.layout, &self.points, landmarks, confidence, &mut self.observation)?;
+        let fit = self.place(t)?;
+        let (pose, refused_since) = self.judge(t, fit);
+        self.lift(&pose);
+        let is_first = self.retarget.is_none();
+        if is_first {
+            let provisional = Calibration::provisional(t, &self.lifted, &pose, self.pivot);
+            self.adopt(character, provisional)?;
+        }
+        let dt = self.last_t.map_or(f64::INFINITY, |last| t - last);
+        (self.pose, self.refused_since, self.last_t) = (Some(pose), refused_since, Some(t));
+        let mut solved = Solved { is_new_neutral: false, is_to_report: false };
+        if refused_since.is_none() {
+            self.calibrator.observe(t, &self.lifted, &pose, self.pivot);
+            if let Some(found) = self.calibrator.poll(t) {
+                solved.is_to_report = found.requested || self.calibrator.is_first();
+                solved.is_new_neutral = self.adopt(character, found).is_ok();
+                solved.is_to_report &= solved.is_new_neutral;
+                // The performer's head has another shape now: look at the frame again.
+                if let Ok(fit) = self.place(t) {
+                    self.pose = Some(fit.pose);
+                    self.lift(&fit.pose);
+                }
+            }
+        }
+        self.smooth(dt);
+        if let Some(retarget) = &mut self.retarget {
+            retarget.solve(&self.smoothed, &mut state.motions);
+        }
+        self.write_head(dt, state);
+        state.weights = None;
+        state.is_placed = false;
+        Ok(solved)
+    }
+
+    /// The head pose that fits this frame best.
+    fn place(&mut self, t: f64) -> Result<Fit, SolveError> {
+        let rays = &self.observation.rays;
+        if self.points.stable.is_empty() {
+            self.placing.clear();
+            self.placing.extend((0..self.points.len()).map(|i| (i, 1.0)));
+            let pose = head_pose::frontal_pose(&self.model, rays, &self.placing)?;
+            return Ok(Fit { pose, error: 0.0 });
+        }
+        self.placing.clear();
+        self.placing.extend(self.points.stable.iter().filter(|(i, _)| self.observation.is_sure[*i]));
+        if self.placing.len() < 4 {
+            self.placing.clear();
+            self.placing.extend_from_slice(&self.points.stable);
+        }
+        let is_recent = self.last_t.is_some_and(|last| t - last <= LONGEST_GAP);
+        let guess = self.pose.filter(|_| is_recent);
+        let fit = head_pose::refine(guess, &self.model, rays, &self.placing, self.unit)?;
+        if guess.is_some() && fit.error > self.config.max_reprojection {
+            // The last pose may have led into a blind alley.
+            let afresh = head_pose::refine(None, &self.model, rays, &self.placing, self.unit)?;
+            return Ok(if afresh.error < fit.error { afresh } else { fit });
+        }
+        Ok(fit)
+    }
+
+    /// Refuses a pose that fits badly in favour of the last one, for a while. Gives the pose to use and since when the
+    /// tracker's have been refused. Until the performer's own proportions are known everything fits badly.
+    fn judge(&self, t: f64, fit: Fit) -> (Pose, Option<f64>) {
+        match self.pose {
+            Some(last) if fit.error > self.config.max_reprojection => {
+                let since = self.refused_since.unwrap_or(t);
+                if t - since < LONGEST_REFUSAL { (last, Some(since)) } else { (fit.pose, Some(since)) }
+            }
+            _ => (fit.pose, None),
+        }
+    }
+
+    fn lift(&mut self, pose: &Pose) {
+        let matrix = pose.matrix();
+        let is_first = self.retarget.is_none();
+        for (i, lifted) in self.lifted.iter_mut().enumerate() {
+            if self.observation.is_sure[i] || is_first {
+                let point = head_pose::lift(&matrix, pose.translation, self.observation.rays[i], self.model[i].z);
+                *lifted = DVec2::new(point.x, point.y);
+            }
+        }
+    }
+
+    /// Puts a neutral to use.
+    fn adopt(&mut self, character: &Character, calibration: Calibration) -> Result<(), SolveError> {
+        let neutral: Vec<DVec2> = calibration.points.iter().map(|p| DVec2::from(*p)).collect();
+        self.retarget = Some(Retarget::new(character, &self.points, &neutral, self.config.ridge)?);
+        for (model, neutral) in self.model.iter_mut().zip(&neutral) {
+            (model.x, model.y) = (neutral.x, neutral.y);
+        }
+        self.calibration = Some(calibration);
+        for filter in [&mut self.brows, &mut self.eyelids, &mut self.mouth] {
+            filter.bank.reset();
+        }
+        self.head.reset();
+        Ok(())
+    }
+
+    fn smooth(&mut self, dt: f64) {
+        for filter in [&mut self.brows, &mut self.eyelids, &mut self.mouth] {
+            for (pair, &i) in filter.samples.chunks_exact_mut(2).zip(&filter.points) {
+                pair[0] = self.lifted[i].x;
+                pair[1] = self.lifted[i].y;
+            }
+            let smoothed = filter.bank.update(&filter.samples, dt);
+            for (pair, &i) in smoothed.chunks_exact(2).zip(&filter.points) {
+                self.smoothed[i] = DVec2::new(pair[0], pair[1]);
+            }
+        }
+    }
+
+    /// Head rotation and the pivot's way since neutral, smoothed.
+    fn write_head(&mut self, dt: f64, state: &mut FaceState) {
+        let (Some(pose), Some(calibration)) = (self.pose, &self.calibration) else { return };
+        let neutral_from_camera = DQuat::from_array(calibration.head_rotation).inverse();
+        let turn = rotation::to_vector((neutral_from_camera * pose.rotation).normalize());
+        let pivot = rotation::rotate(pose.rotation, self.pivot) + pose.translation;
+        let shift = rotation::rotate(neutral_from_camera, pivot - DVec3::from(calibration.head_position)) / HEAD_RADIUS;
+        let smoothed = self.head.update(&[turn.x, turn.y, turn.z, shift.x, shift.y, shift.z], dt);
+        let farthest = f64::from(MAX_HEAD_TRAVEL);
+        for axis in 0..3 {
+            state.head[axis] = smoothed[axis];
+            state.head[3 + axis] = (smoothed[3 + axis] * HEAD_RADIUS).clamp(-farthest, farthest);
+        }
+    }
+}
