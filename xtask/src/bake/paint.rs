@@ -5,15 +5,24 @@
 mod atlas;
 mod chart;
 mod encode;
+mod eyes;
+mod features;
 mod furrow;
+mod hairs;
 mod noise;
+mod occlusion;
+mod pores;
+mod skin;
 mod slopes;
+mod teeth;
 mod wrinkles;
 
-use super::bust::{Bust, Encoded, Painted, SlopeMap};
+use super::bust::{Bust, Painted};
 use anyhow::Result;
 use atlas::Atlas;
 use chart::Chart;
+use features::Features;
+use occlusion::Openness;
 
 /// Texels a side of colour and pores.
 const FINE: usize = 2048;
@@ -23,16 +32,20 @@ const COARSE: usize = 1024;
 /// Paints everything.
 pub fn paint(bust: &Bust) -> Result<Painted> {
     let chart = Chart::new(bust);
-    let fine = Atlas::new(bust, FINE);
+    let features = Features::new(&chart, bust);
     let coarse = Atlas::new(bust, COARSE);
-    let plain = |color: [u8; 3]| encode::jpeg(8, &color.repeat(64), 90);
-    let _ = &fine;
+    let openness = Openness::new(bust, &coarse);
+    let wrinkles = bust.poses.iter().map(|pose| wrinkles::paint(&chart, &coarse, pose.name)).collect::<Result<_>>()?;
+    let skin_surface = occlusion::paint(&coarse, &features, &openness)?;
+
+    let fine = Atlas::new(bust, FINE);
+    let hairs = hairs::draw(&fine, &features);
     Ok(Painted {
-        skin_albedo: plain([208, 162, 140])?,
-        skin_slopes: SlopeMap { image: plain([128, 128, 255])?, scale: 1.0 },
-        skin_surface: plain([255, 128, 0])?,
-        wrinkles: bust.poses.iter().map(|pose| wrinkles::paint(&chart, &coarse, pose.name)).collect::<Result<_>>()?,
-        eye_albedo: plain([230, 225, 220])?,
-        teeth_albedo: plain([226, 215, 196])?,
+        skin_albedo: skin::paint(&fine, &features, &hairs, |uv| openness.at(uv))?,
+        skin_slopes: pores::paint(&fine, &features, &hairs, &wrinkles::permanent(&chart))?,
+        skin_surface,
+        wrinkles,
+        eye_albedo: eyes::paint(bust)?,
+        teeth_albedo: teeth::paint()?,
     })
 }

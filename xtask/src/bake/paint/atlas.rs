@@ -17,6 +17,8 @@ pub struct Atlas<'a> {
 /// What one texel shows. Millimetres, head space.
 #[derive(Debug, Clone, Copy)]
 pub struct Texel {
+    /// Centre of the texel in texture space.
+    pub uv: Vec2,
     /// Place on the rest surface, mm.
     pub place: Vec3,
     /// Unit normal.
@@ -67,6 +69,7 @@ impl<'a> Atlas<'a> {
         let raw = (0..3).fold(Vec3::ZERO, |sum, k| sum + self.surface.tangents[corners[k]].truncate() * weights[k]);
         let tangent = (raw - normal * normal.dot(raw)).normalize_or(normal.any_orthonormal_vector());
         Some(Texel {
+            uv: self.centre(x, y),
             place: sum3(&self.surface.positions) * 1000.0,
             normal,
             tangent,
@@ -74,6 +77,22 @@ impl<'a> Atlas<'a> {
             corners: corners.map(|i| self.surface.regions[i]),
             weights,
         })
+    }
+
+    /// As [`Atlas::texel`], with how far the place moves from texel to texel along x and y, mm.
+    pub fn texel_with_steps(&self, x: usize, y: usize) -> Option<(Texel, [Vec3; 2])> {
+        let texel = self.texel(x, y)?;
+        let [a, b, c] = self.surface.triangles[self.triangles[y * self.size + x] as usize].map(|i| i as usize);
+        let (e1, e2) = (self.surface.positions[b] - self.surface.positions[a], self.surface.positions[c] - self.surface.positions[a]);
+        let (d1, d2) = (self.surface.uvs[b] - self.surface.uvs[a], self.surface.uvs[c] - self.surface.uvs[a]);
+        let per_texel = 1000.0 / (d1.perp_dot(d2) * self.size as f32);
+        let steps = [(e1 * d2.y - e2 * d1.y) * per_texel, (e2 * d1.x - e1 * d2.x) * per_texel];
+        steps.iter().all(|step| step.is_finite()).then_some((texel, steps))
+    }
+
+    /// True on the islands and their skirts.
+    pub fn is_covered(&self, x: usize, y: usize) -> bool {
+        self.triangles[y * self.size + x] != NONE
     }
 
     /// Computes one value a covered texel, rows shared between two threads; `None` outside the islands.

@@ -1,6 +1,6 @@
 //! Pictures as they go into the file.
 
-use super::Encoded;
+use super::super::bust::Encoded;
 use anyhow::Result;
 use image::ExtendedColorType::Rgb8;
 use image::ImageEncoder;

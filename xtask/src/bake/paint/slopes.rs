@@ -1,7 +1,8 @@
 //! From heights to partial-derivative maps: `p = n.xy / n.z` in the tangent frame.
 
+use super::super::bust::SlopeMap;
 use super::atlas::{Atlas, Texel, fill_gaps};
-use super::{SlopeMap, encode};
+use super::encode;
 use anyhow::Result;
 use glam::{Vec2, Vec3};
 

@@ -112,7 +112,8 @@ impl Pen<'_> {
     fn line(&mut self, side: Side, marks: &[Mark], depth: f32, width: f32, finish: impl FnOnce(&mut Stroke)) {
         let mut dice = self.dice();
         // The halves of a face are never folded alike.
-        let path = marks.iter().map(|&(index, x, y)| self.chart.at(side, index, (x + 0.7 * dice.signed(), y + 0.7 * dice.signed()))).collect();
+        let path =
+            marks.iter().map(|&(index, x, y)| self.chart.at(side, index, (x + 0.7 * dice.signed(), y + 0.7 * dice.signed()))).collect();
         self.path(path, depth * dice.range(0.82, 1.15), width * dice.range(0.9, 1.12), finish);
     }
 
@@ -245,15 +246,21 @@ fn smile(pen: &mut Pen) {
     pen.seed = 500;
     for side in Side::BOTH {
         let outward = side.sign();
-        pen.line(side, &[(35, 4.5, 8.0), (35, 9.5, 2.0), (35, 15.5, -6.0), (54, 7.5, 5.5), (54, 9.5, -4.0), (54, 8.0, -12.0)], 1.35, 1.25, |s| {
-            s.shoulder = 5.5;
-            s.bulge = 0.6;
-            s.lean = 0.6 * outward;
-            s.taper = (0.12, 0.4);
-            s.broken = 0.08;
-            s.stray = 0.8;
-            s.companions = 4;
-        });
+        pen.line(
+            side,
+            &[(35, 4.5, 8.0), (35, 9.5, 2.0), (35, 15.5, -6.0), (54, 7.5, 5.5), (54, 9.5, -4.0), (54, 8.0, -12.0)],
+            1.35,
+            1.25,
+            |s| {
+                s.shoulder = 5.5;
+                s.bulge = 0.6;
+                s.lean = 0.6 * outward;
+                s.taper = (0.12, 0.4);
+                s.broken = 0.08;
+                s.stray = 0.8;
+                s.companions = 4;
+            },
+        );
         pen.line(side, &[(54, 15.0, 11.0), (54, 17.5, 2.0), (54, 17.0, -8.0), (54, 13.5, -17.0)], 0.55, 1.1, |s| {
             s.shoulder = 4.5;
             s.lean = 0.5 * outward;

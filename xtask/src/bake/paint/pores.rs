@@ -1,0 +1,109 @@
+//! The relief of the resting skin: pores, the net of fine creases, lip folds, faint lines, stubs of hair.
+
+use super::super::bust::SlopeMap;
+use super::atlas::{Atlas, Texel};
+use super::features::{Features, Marks};
+use super::furrow::Furrows;
+use super::hairs::Hairs;
+use super::noise::{cells, fractal, lerp, noise, smoothstep};
+use super::{encode, slopes};
+use anyhow::Result;
+use glam::Vec3;
+
+/// Height of a hair over the skin as the map shows it, mm.
+const HAIR_HEIGHT: f32 = 0.045;
+
+/// What the pattern is like at one place.
+struct Grain {
+    /// Distance between pores, mm.
+    period: f32,
+    /// Depth of pores, mm.
+    pore: f32,
+    /// Depth of the creases between them, mm.
+    crease: f32,
+    /// Direction along which pores are drawn out, with their elongation.
+    pull: Vec3,
+    /// Depth of the upright folds of the lips, mm.
+    fold: f32,
+    /// Height of soft unevenness, mm.
+    lumps: f32,
+}
+
+/// Paints the base slope map.
+pub fn paint(atlas: &Atlas, features: &Features, hairs: &Hairs, lines: &Furrows) -> Result<SlopeMap> {
+    let size = atlas.size();
+    let mut slopes = slopes::of_relief(atlas, 0.06, |texel| {
+        let marks = features.marks(texel);
+        let grain = grain(features, texel, &marks);
+        let (normal, outside) = (texel.normal, 1.0 - marks.mouth.max(marks.socket));
+        Some(move |p: Vec3| outside * grain.height(p) + lines.height(p, normal))
+    });
+    add_hairs(atlas, hairs, &mut slopes);
+    let scale = slopes::scale_for(&slopes, 1e-3);
+    let image = encode::jpeg(size, &slopes::encode_map(size, &slopes, scale, false), 85)?;
+    Ok(SlopeMap { image, scale })
+}
+
+fn grain(features: &Features, texel: &Texel, marks: &Marks) -> Grain {
+    let chart = features.chart;
+    let coarse = (marks.nose_tip + 0.55 * marks.cheek + 0.4 * marks.forehead + 0.35 * marks.chin).min(1.0);
+    let delicate = (marks.upper_lid + marks.under_eye + marks.waterline).min(1.0);
+    let bare = 1.0 - marks.lip;
+    let beside = texel.place - chart.landmark(30);
+    // Skin of the cheeks is drawn down and outward, that of the neck across.
+    let pull = Vec3::new(0.5 * beside.x.signum(), -1.0, -0.3).lerp(Vec3::X, marks.neck).normalize();
+    let pull = (pull - texel.normal * texel.normal.dot(pull)).normalize_or(texel.tangent);
+    Grain {
+        period: lerp(lerp(0.80, 1.05, coarse), 0.60, delicate),
+        pore: bare * lerp(lerp(0.016, 0.052, coarse), 0.005, delicate) * (1.0 - 0.7 * marks.hair) * (1.0 - 0.6 * marks.ear),
+        crease: bare * lerp(0.020, 0.024, delicate) * (1.0 - 0.5 * marks.ear),
+        pull: pull * lerp(0.30, 0.12, coarse),
+        fold: 0.07 * marks.lip,
+        lumps: bare * lerp(0.030, 0.055, marks.chin.max(marks.neck * 0.6)),
+    }
+}
+
+impl Grain {
+    fn height(&self, p: Vec3) -> f32 {
+        let stretched = p - self.pull * p.dot(self.pull) / self.pull.length();
+        let pores = cells(stretched / self.period, 201);
+        let radius = lerp(0.16, 0.34, (pores.id & 255) as f32 / 255.0);
+        let pit = smoothstep(radius * 1.5, 0.0, pores.first) * lerp(0.35, 1.0, ((pores.id >> 8) & 255) as f32 / 255.0);
+        let warp = Vec3::new(noise(p / 1.7, 202), noise(p / 1.7, 203), noise(p / 1.7, 204)) * 0.35;
+        let net = cells((stretched + warp) / (self.period * 0.78), 205);
+        let crease = smoothstep(0.16, 0.0, net.second - net.first);
+        let mut height = -self.pore * pit - self.crease * crease + self.lumps * fractal(p / 2.6, 2, 206);
+        if self.fold > 0.0 {
+            let fold = noise(Vec3::new((p.x + 0.7 * noise(p / 2.6, 207)) / 0.95, p.y / 8.0, 0.5), 208);
+            let fine = noise(Vec3::new((p.x + 0.4 * noise(p / 1.3, 209)) / 0.45, p.y / 4.0, 1.5), 210);
+            height -= self.fold * (smoothstep(0.0, 0.6, fold) + 0.4 * fine);
+        }
+        height
+    }
+}
+
+/// Adds the relief of the drawn hairs, by differences between neighbouring texels.
+fn add_hairs(atlas: &Atlas, hairs: &Hairs, slopes: &mut [Option<[f32; 2]>]) {
+    let size = atlas.size();
+    for y in 1..size - 1 {
+        for x in 1..size - 1 {
+            let index = y * size + x;
+            let around = [index - 1, index + 1, index - size, index + size];
+            if around.iter().all(|&i| hairs.cover[i] == 0.0) {
+                continue;
+            }
+            let (Some(slope), Some((texel, [sx, sy]))) = (&mut slopes[index], atlas.texel_with_steps(x, y)) else { continue };
+            let dx = (hairs.cover[index + 1] - hairs.cover[index - 1]) * 0.5 * HAIR_HEIGHT;
+            let dy = (hairs.cover[index + size] - hairs.cover[index - size]) * 0.5 * HAIR_HEIGHT;
+            let (xx, xy, yy) = (sx.dot(sx), sx.dot(sy), sy.dot(sy));
+            let determinant = xx * yy - xy * xy;
+            if determinant <= 1e-9 {
+                continue;
+            }
+            // Gradient in space from the differences along two oblique steps (dual basis).
+            let gradient = sx * ((dx * yy - dy * xy) / determinant) + sy * ((dy * xx - dx * xy) / determinant);
+            slope[0] -= gradient.dot(texel.tangent);
+            slope[1] -= gradient.dot(texel.bitangent);
+        }
+    }
+}
