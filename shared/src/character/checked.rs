@@ -441,7 +441,11 @@ fn check_poses(given: &[schema::Pose], bones: &[Bone], index_of: &BTreeMap<&str,
             if travel.length() > 0.0 && travel.length() < MIN_POSE_TRAVEL {
                 return Err(CharacterError::field(
                     field(),
-                    format!("moves the bone by {:.3} mm, expected nothing or at least {} mm", travel.length() * 1e3, MIN_POSE_TRAVEL * 1e3),
+                    format!(
+                        "moves the bone by {:.3} mm, expected nothing or at least {:.1} mm",
+                        travel.length() * 1e3,
+                        MIN_POSE_TRAVEL * 1e3
+                    ),
                 ));
             }
             if travel.abs().max_element() > MAX_BONE_TRAVEL {
