@@ -231,3 +231,157 @@ fn solve_chosen(
     let is_independent = (0..num).all(|row| !is_chosen[row] || a[row][row] * a[row][row] > PARALLEL * gram[row][row]);
     (factored_is_regular && is_independent).then_some(b)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An evaluator for bones at `rest` and poses given as displacements.
+    fn evaluator(rest: &[[f32; 3]], poses: &[Vec<[f32; 3]>], mode: Mode) -> Evaluator {
+        let segments: Vec<Vec3> = poses.iter().flatten().map(|u| Vec3::from(*u)).collect();
+        Evaluator {
+            num_bones: rest.len(),
+            num_poses: poses.len(),
+            rest: rest.iter().map(|r| Vec3::from(*r)).collect(),
+            scaled_segments: segments.iter().map(|u| if *u == Vec3::ZERO { *u } else { *u / u.length_squared() }).collect(),
+            segments,
+            groups: Vec::new(),
+            mode,
+            group_degenerate: GroupDegenerate::Exclude,
+        }
+    }
+
+    fn influences(evaluator: &Evaluator, displacements: &[[f32; 3]]) -> Vec<f32> {
+        let points: Vec<Vec3> = evaluator.rest.iter().zip(displacements).map(|(rest, d)| *rest + Vec3::from(*d)).collect();
+        let mut out = vec![0.0; evaluator.num_poses * evaluator.num_bones];
+        evaluator.evaluate(&points, &mut out);
+        out
+    }
+
+    fn assert_near(got: &[f32], want: &[f32]) {
+        assert_eq!(got.len(), want.len());
+        for (a, b) in got.iter().zip(want) {
+            assert!((a - b).abs() < 1e-5, "got {got:?}, expected {want:?}");
+        }
+    }
+
+    #[test]
+    fn projection_is_linear_and_clamped() {
+        let one = evaluator(&[[0.0; 3]], &[vec![[0.0, 2.0, 0.0]]], Mode::Independent);
+        assert_near(&influences(&one, &[[0.0, 1.0, 0.0]]), &[0.5]);
+        assert_near(&influences(&one, &[[0.0, 2.6, 0.1]]), &[1.0]);
+        assert_near(&influences(&one, &[[0.0, -0.5, 0.1]]), &[0.0]);
+        let elsewhere = evaluator(&[[1.0, 2.0, 3.0]], &[vec![[0.5, 0.0, 0.5]]], Mode::Independent);
+        assert_near(&influences(&elsewhere, &[[0.2, 0.9, 0.1]]), &[0.3]);
+    }
+
+    #[test]
+    fn a_reference_pose_in_metres_reaches_one() {
+        // The printed formula, which divides by the length alone, would give 0.012.
+        let brow = evaluator(&[[0.0; 3]], &[vec![[0.0, 0.012, 0.0]]], Mode::Independent);
+        assert_near(&influences(&brow, &[[0.0, 0.012, 0.0]]), &[1.0]);
+    }
+
+    #[test]
+    fn a_turning_bone_is_linear_in_its_angle_at_its_driver_point() {
+        let arm = glam::DVec3::new(0.0, -0.08, 0.08);
+        let swing = |degrees: f64| {
+            let turn = super::super::rotation::from_pitch_yaw(degrees.to_radians(), 0.0);
+            (super::super::rotation::rotate(turn, arm) - arm).as_vec3().to_array()
+        };
+        assert_near(&swing(20.0), &[0.0, -0.0225370211, -0.0321862018]);
+        let jaw = evaluator(&[[0.0, -0.10, 0.02]], &[vec![swing(20.0)]], Mode::Independent);
+        for (degrees, want) in [(5.0, 0.2490450406), (10.0, 0.5), (15.0, 0.7509549594), (25.0, 1.0)] {
+            assert_near(&influences(&jaw, &[swing(degrees)]), &[want]);
+        }
+    }
+
+    #[test]
+    fn groups_average_what_has_been_clamped() {
+        let pose = vec![[0.0, 1.0, 0.0]; 3];
+        let mut three = evaluator(&[[0.0; 3]; 3], &[pose], Mode::Independent);
+        three.groups = vec![vec![0, 1, 2]];
+        let moved = [[0.0, 1.6, 0.0], [0.0, -0.4, 0.0], [0.0, 0.3, 0.0]];
+        assert_near(&influences(&three, &moved), &[0.433333333; 3]);
+
+        // The second member (as the vector counts, from zero at -0.4 here) does not move in the pose.
+        let mut with_still = evaluator(&[[0.0; 3]; 3], &[vec![[0.0, 1.0, 0.0], [0.0; 3], [0.0, 1.0, 0.0]]], Mode::Independent);
+        with_still.groups = vec![vec![0, 1, 2]];
+        assert_near(&influences(&with_still, &moved), &[0.65; 3]);
+        with_still.group_degenerate = GroupDegenerate::Zero;
+        assert_near(&influences(&with_still, &moved), &[0.433333333; 3]);
+    }
+
+    #[test]
+    fn a_group_no_pose_moves_is_zero() {
+        let mut still = evaluator(&[[0.0; 3]; 2], &[vec![[0.0; 3]; 2]], Mode::Independent);
+        still.groups = vec![vec![0, 1]];
+        assert_near(&influences(&still, &[[0.0, 1.0, 0.0]; 2]), &[0.0; 2]);
+    }
+
+    #[test]
+    fn joint_mode_counts_a_motion_once() {
+        let poses = [vec![[0.0, 1.0, 0.0]], vec![[0.6, 0.8, 0.0]]];
+        let independent = evaluator(&[[0.0; 3]], &poses, Mode::Independent);
+        let joint = evaluator(&[[0.0; 3]], &poses, Mode::Joint);
+        for (d, alone, together) in [
+            ([0.0, 1.0, 0.0], [1.0, 0.8], [1.0, 0.0]),
+            ([0.3, 0.9, 0.0], [0.9, 0.9], [0.5, 0.5]),
+            ([-0.2, 0.9, 0.0], [0.9, 0.6], [0.9, 0.0]),
+            ([0.6, 0.3, 0.0], [0.3, 0.6], [0.0, 0.6]),
+        ] {
+            assert_near(&influences(&independent, &[d]), &alone);
+            assert_near(&influences(&joint, &[d]), &together);
+        }
+    }
+
+    #[test]
+    fn parallel_poses_fall_back_to_independent() {
+        let joint = evaluator(&[[0.0; 3]], &[vec![[0.0, 1.0, 0.0]], vec![[0.0, 2.0, 0.0]]], Mode::Joint);
+        assert_near(&influences(&joint, &[[0.0, 1.0, 0.0]]), &[1.0, 0.5]);
+    }
+
+    #[test]
+    fn joint_mode_is_least_squares_for_more_poses() {
+        let units = [[1.0, 0.2, 0.0], [0.1, 1.0, 0.3], [-0.2, 0.3, 0.9], [0.5, 0.5, 0.5]];
+        let poses: Vec<Vec<[f32; 3]>> = units.iter().map(|u| vec![*u]).collect();
+        let four = evaluator(&[[0.0; 3]], &poses, Mode::Joint);
+        let three = evaluator(&[[0.0; 3]], &poses[..3], Mode::Joint);
+        for d in [[0.3, 0.4, 0.2], [0.5, -0.2, 0.1], [-0.3, 0.6, 0.4], [0.1, 0.1, -0.5]] {
+            for (evaluator, num) in [(&three, 3), (&four, 4)] {
+                let shares = influences(evaluator, &[d]);
+                let left = (0..num).fold(Vec3::from(d), |left, k| left - Vec3::from(units[k]) * shares[k]);
+                for k in 0..num {
+                    // Karush, Kuhn, Tucker: no pose would still help, and those in use are used up.
+                    let gradient = left.dot(Vec3::from(units[k]));
+                    assert!(gradient < 1e-5 && (shares[k] == 0.0 || gradient.abs() < 1e-5), "{d:?}: {shares:?}, pose {k}: {gradient}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_point_that_is_no_number_keeps_its_coefficient() {
+        for mode in [Mode::Independent, Mode::Joint] {
+            let one = evaluator(&[[0.0; 3]], &[vec![[0.0, 2.0, 0.0]]], mode);
+            let mut out = vec![0.25];
+            one.evaluate(&[Vec3::new(0.0, f32::NAN, 0.0)], &mut out);
+            assert_eq!(out, [0.25]);
+        }
+    }
+
+    #[test]
+    fn the_whole_of_a_face_is_evaluated() {
+        let rest = [[-0.03, 0.05, 0.09], [0.03, 0.05, 0.09], [0.0, -0.08, 0.1]];
+        let up = vec![[0.0, 0.010, 0.0], [0.0, 0.010, 0.0], [0.0; 3]];
+        let frown = vec![[0.004, -0.006, 0.0], [-0.004, -0.006, 0.0], [0.0, -0.02, -0.004]];
+        let mut face = evaluator(&rest, &[up, frown], Mode::Independent);
+        let moved = [[0.001, 0.006, 0.0], [0.0, 0.012, 0.001], [0.0, -0.01, 0.0]];
+        assert_near(&influences(&face, &moved), &[0.6, 1.0, 0.0, 0.0, 0.0, 0.4807692308]);
+        face.groups = vec![vec![0, 1]];
+        let grouped = influences(&face, &moved);
+        assert_near(&grouped, &[0.8, 0.8, 0.0, 0.0, 0.0, 0.4807692308]);
+        let bytes: Vec<u8> = grouped.iter().map(|value| (value * 255.0 + 0.5).floor() as u8).collect();
+        assert_eq!(bytes, [204, 204, 0, 0, 0, 123]);
+    }
+}

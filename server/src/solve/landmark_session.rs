@@ -77,6 +77,11 @@ impl LandmarkSession {
                 groups.push(Group::Eyelids);
             }
         }
+        if !points.has_perspective {
+            // A similarity sees a flat face: with depths of its own the lifted points would not fit themselves.
+            let mean = model.iter().map(|point| point.z).sum::<f64>() / model.len() as f64;
+            model.iter_mut().for_each(|point| point.z = mean);
+        }
         let num = model.len();
         let group_filter = |group, one_euro| {
             let points: Vec<usize> = (0..num).filter(|&i| groups[i] == group).collect();
@@ -193,17 +198,15 @@ impl LandmarkSession {
     /// The head pose that fits this frame best.
     fn place(&mut self, t: f64) -> Result<Fit, SolveError> {
         let rays = &self.observation.rays;
-        if self.points.stable.is_empty() {
-            self.placing.clear();
-            self.placing.extend((0..self.points.len()).map(|i| (i, 1.0)));
-            let pose = head_pose::frontal_pose(&self.model, rays, &self.placing)?;
-            return Ok(Fit { pose, error: 0.0 });
-        }
         self.placing.clear();
         self.placing.extend(self.points.stable.iter().filter(|(i, _)| self.observation.is_sure[*i]));
         if self.placing.len() < 4 {
             self.placing.clear();
             self.placing.extend_from_slice(&self.points.stable);
+        }
+        if !self.points.has_perspective {
+            let pose = head_pose::frontal_pose(&self.model, rays, &self.placing)?;
+            return Ok(Fit { pose, error: 0.0 });
         }
         let is_recent = self.last_t.is_some_and(|last| t - last <= LONGEST_GAP);
         let guess = self.pose.filter(|_| is_recent);

@@ -130,8 +130,8 @@ mod tests {
         for (got, want) in x.iter().zip([1.0, 2.0, 3.0]) {
             assert!((got - want).abs() < 1e-12, "{x:?}");
         }
-        // Inverse of the matrix above has 1-norm 16/23 (its second row-sum by columns): |column 0| = (3+12+1)/23.
-        assert!((lu.inverse_norm() - 16.0 / 23.0).abs() < 1e-12, "{}", lu.inverse_norm());
+        // The first column of the inverse is (-3, 12, 1) / 25, its largest.
+        assert!((lu.inverse_norm() - 16.0 / 25.0).abs() < 1e-12, "{}", lu.inverse_norm());
     }
 
     #[test]

@@ -12,6 +12,8 @@ const MEDIAPIPE_IRISES: [usize; 2] = [468, 473];
 const FEWEST_FEATURES: usize = 5;
 /// A user's point this near to a stable iBUG landmark, as a fraction of the interocular distance, counts as stable.
 const STABLE_REACH: f64 = 0.08;
+/// Where there are too few of them, all points place the head, weighed down beyond this distance from a stable landmark.
+const STABLE_SOFTNESS: f64 = 0.05;
 /// A head pose by perspective takes at least this many stable points.
 const FEWEST_STABLE: usize = 5;
 /// Reach of a user's point over bones without a point of their own, as a fraction of the interocular distance.
@@ -46,8 +48,10 @@ pub(super) struct PointSet {
     /// Where the character has each point, metres, head space.
     pub(super) model: Vec<DVec3>,
     pub(super) groups: Vec<Group>,
-    /// Points that expressions do not move, with their weights in the head pose; empty where there are too few.
+    /// Points that expressions move little, with their weights in the head pose.
     pub(super) stable: Vec<(usize, f64)>,
+    /// True where they are enough for a pose in perspective; else size, roll and place are all that is taken.
+    pub(super) has_perspective: bool,
     /// Centres of the regression.
     pub(super) centres: Vec<usize>,
     /// True where points are numbered as iBUG numbers them.
@@ -97,6 +101,7 @@ impl PointSet {
             model: character.ibug68.iter().map(|p| p.as_dvec3()).collect(),
             groups: (0..NUM_IBUG).map(group_of).collect(),
             stable: IBUG_STABLE.iter().map(|&i| (i, weight_of(i))).collect(),
+            has_perspective: true,
             centres: (0..NUM_IBUG).filter(|&i| is_centre(i)).collect(),
             is_ibug: true,
             shares,
@@ -134,10 +139,20 @@ impl PointSet {
                 _ => Group::Mouth,
             })
             .collect();
-        let is_stable = |p: DVec3| IBUG_STABLE.iter().any(|&i| character.ibug68[i].as_dvec3().distance(p) < STABLE_REACH * unit);
-        let mut stable: Vec<(usize, f64)> = model.iter().enumerate().filter(|(_, p)| is_stable(**p)).map(|(i, _)| (i, 1.0)).collect();
-        if stable.len() < FEWEST_STABLE {
-            stable.clear();
+        // Distance to the nearest stable landmark, interocular distances.
+        let off: Vec<f64> = model
+            .iter()
+            .map(|p| IBUG_STABLE.iter().map(|&i| character.ibug68[i].as_dvec3().distance(*p) / unit).fold(f64::INFINITY, f64::min))
+            .collect();
+        let mut stable: Vec<(usize, f64)> = (0..off.len()).filter(|&i| off[i] < STABLE_REACH).map(|i| (i, 1.0)).collect();
+        let has_perspective = stable.len() >= FEWEST_STABLE;
+        if !has_perspective {
+            // All of them, or the brows of a layout of brows and lips would be believed to be still.
+            let weight = |off: f64| {
+                let square = (off / STABLE_SOFTNESS) * (off / STABLE_SOFTNESS);
+                1.0 / (1.0 + square * square)
+            };
+            stable = off.iter().enumerate().map(|(i, off)| (i, weight(*off))).collect();
         }
         let shares = character
             .bones
@@ -152,7 +167,17 @@ impl PointSet {
                 neighbours(&model, bone.rest.as_dvec3(), NEIGHBOUR_REACH * unit)
             })
             .collect();
-        Ok(Self { source_of, irises: None, centres: (0..model.len()).collect(), model, groups, stable, is_ibug: false, shares })
+        Ok(Self {
+            source_of,
+            irises: None,
+            centres: (0..model.len()).collect(),
+            model,
+            groups,
+            stable,
+            has_perspective,
+            is_ibug: false,
+            shares,
+        })
     }
 
     /// The eye's points, where the layout has them.
@@ -188,6 +213,7 @@ fn neighbours(points: &[DVec3], at: DVec3, reach: f64) -> Vec<(usize, f32)> {
         if r < 1.0 { (1.0 - r) * (1.0 - r) * (1.0 - r) * (1.0 - r) * (4.0 * r + 1.0) } else { 0.0 }
     };
     let raw: Vec<f64> = points.iter().map(share).collect();
-    let total = raw.iter().sum::<f64>().max(1.0);
+    // A bone amid points follows their mean; one at the edge of their reach fades out.
+    let total = raw.iter().sum::<f64>().max(0.3);
     raw.iter().enumerate().filter(|(_, share)| **share > 0.0).map(|(i, share)| (i, (share / total) as f32)).collect()
 }

@@ -277,3 +277,35 @@ fn solve_gaussians(centres: &[Vec<f32>]) -> Option<(f64, Lu)> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gaussian_weights_interpolate_and_decay_to_the_linear_rig() {
+        // Two channels of linear deltas (6, -4) on one bone; the example at (1, 1) wants 0.5 and everything else is linear.
+        let centres: Vec<Vec<f32>> = vec![vec![0.0, 0.0], vec![1.0, 0.0], vec![0.0, 1.0], vec![1.0, 1.0]];
+        let square = |a: &[f32], b: [f64; 2]| (f64::from(a[0]) - b[0]).powi(2) + (f64::from(a[1]) - b[1]).powi(2);
+        // With sigma = 0.6 in place of the mean distance of 1: distances scaled by 1 / 0.6.
+        let scaled: Vec<Vec<f32>> = centres.clone();
+        let (falloff, lu) = solve_gaussians(&scaled).expect("well-conditioned");
+        assert!((falloff + 0.5).abs() < 1e-12, "sigma is the mean distance to the nearest example");
+        let amplitudes = lu.solve(&[0.0, 0.0, 0.0, 0.5 - 2.0]);
+        let corrected = |w: [f64; 2]| {
+            let bells = centres.iter().zip(&amplitudes).map(|(c, a)| a * libm::exp(falloff * square(c, w))).sum::<f64>();
+            6.0 * w[0] - 4.0 * w[1] + bells
+        };
+        for (w, want) in [([0.0, 0.0], 0.0), ([1.0, 0.0], 6.0), ([0.0, 1.0], -4.0), ([1.0, 1.0], 0.5)] {
+            assert!((corrected(w) - want).abs() < 1e-9, "{w:?}: {}", corrected(w));
+        }
+        assert!((corrected([6.0, 6.0]) - 12.0).abs() < 1e-3, "far away the linear rig is left");
+    }
+
+    #[test]
+    fn nearly_equal_examples_are_regularised() {
+        let centres = vec![vec![0.0], vec![0.5], vec![0.5001], vec![1.0], vec![1.5]];
+        let (_, lu) = solve_gaussians(&centres).expect("regularised");
+        assert!(lu.solve(&[0.0, 1.0, -1.0, 0.0, 0.0]).iter().all(|amplitude| amplitude.abs() < 1e6));
+    }
+}
