@@ -3,26 +3,34 @@
 
 mod autorig;
 mod base;
+mod brows;
 mod bust;
 mod cut;
 mod eyes;
+mod fit;
 mod glb;
 mod landmarks;
+mod lashes;
+mod lids;
 mod mesh;
 mod obj;
 mod paint;
 mod part;
 mod poses;
+mod random;
 mod regions;
 mod rig;
 mod skin;
 mod source;
+mod strands;
 mod subdivide;
+mod surface;
 mod teeth;
 mod uv;
 mod weights;
 
 use anyhow::{Context, Result, ensure};
+use bust::Region;
 use rhytid_shared::Character;
 use rhytid_shared::character::schema;
 use std::collections::BTreeMap;
@@ -51,11 +59,14 @@ fn bake(source: &mut source::Source) -> Result<Vec<u8>> {
     let poses: Vec<schema::Pose> = poses::POSES.iter().map(|recipe| recipe.pose(&skin.mesh, rig)).collect();
 
     let painted = paint::paint(&skin.for_painter())?;
+    let front = surface::Surface::new(&skin.mesh, |v| matches!(skin.regions[v], Region::Face | Region::Eyelid | Region::Body));
     let parts = [
         skin.part()?,
         eyes::build(&base, eyes, [rig.joint_of("eye_l"), rig.joint_of("eye_r")]),
         teeth::build(&base, rig.joint_of("jaw")),
         teeth::tongue(&base, rig.joint_of("jaw")),
+        brows::build(&front, &skin.weights),
+        lashes::build(&skin, eyes),
     ];
     for part in &parts {
         ensure!(part.positions.len() <= usize::from(u16::MAX), "{} has {} vertices", part.material.name(), part.positions.len());

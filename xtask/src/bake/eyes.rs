@@ -12,9 +12,11 @@ pub const TEXTURE_ANGLE: f32 = 1.75;
 /// Radius of the iris on the ball, metres (a grown person's is 5.8 to 6.2 mm).
 pub const IRIS_RADIUS: f32 = 0.0061;
 /// How far the cornea's top stands out of the sphere, as a share of the sphere's radius.
-const CORNEA_HEIGHT: f32 = 0.085;
-const NUM_RINGS: u32 = 30;
-const NUM_SECTORS: u32 = 48;
+const CORNEA_HEIGHT: f32 = 0.045;
+/// The ball is a little smaller than the helper eye, which is meant to overlap the lids: here they only touch.
+const BALL_SHARE: f32 = 0.972;
+const NUM_RINGS: u32 = 22;
+const NUM_SECTORS: u32 = 36;
 
 /// Centre and radius of the helper eye of one side (`l` or `r`).
 pub fn eyeball(base: &Base, group: &str) -> Eyeball {
@@ -24,7 +26,7 @@ pub fn eyeball(base: &Base, group: &str) -> Eyeball {
     });
     let centre = (low + high) * 0.5;
     let radius = vertices.iter().map(|&v| base.positions[v as usize].distance(centre)).sum::<f32>() / vertices.len() as f32;
-    Eyeball { centre, radius }
+    Eyeball { centre, radius: radius * BALL_SHARE }
 }
 
 /// The rotation one expression shape gives the helper eye, from the displacement of its frontmost point.
@@ -98,6 +100,11 @@ pub fn build(base: &Base, eyes: [Eyeball; 2], joints: [u8; 2]) -> Part {
     part
 }
 
+/// Distance of the surface of an eye that looks ahead from its centre, in the direction of `arm`.
+pub fn surface_radius(arm: Vec3, radius: f32) -> f32 {
+    radius_at(libm::acosf((arm.z / arm.length()).clamp(-1.0, 1.0)), radius)
+}
+
 /// Distance of the eye's surface from its centre, `angle` from the front pole: sphere plus a smooth cornea.
 fn radius_at(angle: f32, radius: f32) -> f32 {
     let limbus = libm::asinf(IRIS_RADIUS / radius) * 1.12;
@@ -113,7 +120,7 @@ mod tests {
     #[test]
     fn cornea_is_smooth_and_ends_at_the_limbus() {
         let radius = 0.015;
-        assert!(radius_at(0.0, radius) > 1.05 * radius);
+        assert!(radius_at(0.0, radius) > 1.03 * radius);
         assert_eq!(radius_at(0.6, radius), radius);
         let steps: Vec<f32> = (0..100).map(|i| radius_at(i as f32 * 0.006, radius)).collect();
         assert!(steps.windows(2).all(|pair| pair[1] <= pair[0]));

@@ -97,7 +97,7 @@ pub struct Part {
 }
 
 /// Displacements shorter than this are left out, metres: below what a pixel shows.
-pub const LEAST_DELTA: f32 = 4.0e-5;
+pub const LEAST_DELTA: f32 = 1.2e-4;
 
 /// The entries of a dense displacement list worth storing.
 pub fn sparse(deltas: impl Iterator<Item = Vec3>) -> Vec<(u32, Vec3)> {

@@ -2,9 +2,11 @@
 
 use super::autorig;
 use super::base::{Base, mean};
+use super::brows;
 use super::bust::{Bust, Eyeball, PoseField, Region};
 use super::cut::cut_bust;
 use super::landmarks::IBUG_VERTICES;
+use super::lids;
 use super::mesh::{Face, Mesh};
 use super::part::{Material, Part, sparse};
 use super::poses::POSES;
@@ -12,6 +14,7 @@ use super::regions::{self, Masks};
 use super::rig::{Places, Rig};
 use super::source::Source;
 use super::subdivide::subdivide;
+use super::surface::Surface;
 use super::uv;
 use super::weights::{self, Lip, Weights, shape};
 use anyhow::{Context, Result};
@@ -63,7 +66,11 @@ impl Skin {
         for (landmark, base_vertex) in landmark_vertices.iter_mut().zip(IBUG_VERTICES) {
             *landmark = *new_of.get(&base_vertex).with_context(|| format!("landmark vertex {base_vertex} was cut away"))?;
         }
-        let ibug68 = landmark_vertices.map(|v| mesh.positions[v as usize]);
+        let landmarks = |mesh: &Mesh| landmark_vertices.map(|v| mesh.positions[v as usize]);
+        let lids = lids::fields(&mesh, &regions, eyes, &landmarks(&mesh));
+        lids::clear_the_ball(&mut mesh, &regions, eyes, &lids.fields);
+        let mut ibug68 = landmarks(&mesh);
+        place_brow_landmarks(&mesh, &regions, &mut ibug68)?;
 
         let jaw_pivot = jaw_hinge(base);
         let is_outside = |v: usize| matches!(regions[v], Region::Face | Region::Lips | Region::Body | Region::Eyelid);
@@ -71,25 +78,23 @@ impl Skin {
             let v = autorig::nearest(&mesh.positions, point, is_outside);
             (v, mesh.positions[v as usize])
         };
-        let lids = lid_fields(&mesh, &regions, eyes, &ibug68);
         let places = Places {
             ibug68: &ibug68,
             eyes,
             jaw_pivot,
             head_pivot: mean(&base.positions, &base.obj.vertices_of("joint-head")),
             neck_pivot: mean(&base.positions, &base.obj.vertices_of("joint-neck")),
-            lid_degrees: lids.degrees,
+            lid_degrees: lids::LID_DEGREES,
             lid_points: lids.points,
         };
         let rig = Rig::new(&places, on_skin);
 
         let lips = lip_sides(&mesh, &ibug68);
-        let jaw_angle = libm::atanf(libm::tanf(JAW_OPEN_RADIANS));
         let jaw: Vec<f32> = weights::turn_angles(&mesh.positions, &mesh.morphs[shape("jawOpen")], jaw_pivot, 0.02)
             .into_iter()
-            .map(|angle| (angle / jaw_angle).clamp(0.0, 1.0))
+            .map(|angle| (angle / JAW_OPEN_RADIANS).clamp(0.0, 1.0))
             .collect();
-        let weights = weights::build(&weights::Skin { mesh: &mesh, regions: &regions, lips: &lips, eyes, jaw, lids: lids.fields }, &rig);
+        let weights = weights::build(&weights::Skin { mesh: &mesh, regions: &regions, lips: &lips, jaw, lids: lids.fields, jaw_pivot, jaw_open: JAW_OPEN_RADIANS }, &rig);
         Ok(Self { mesh, regions, ibug68, eyes, rig, weights })
     }
 
@@ -186,6 +191,19 @@ fn jaw_hinge(base: &Base) -> Vec3 {
     Vec3::new(0.0, centre.y + 0.5 * shift.y - half_cot * shift.z, centre.z + 0.5 * shift.z + half_cot * shift.y)
 }
 
+/// The brows' landmarks lie on the middle line of the hair, which is not the mesh's own ridge.
+fn place_brow_landmarks(mesh: &Mesh, regions: &[Region], ibug68: &mut [Vec3; NUM_IBUG]) -> Result<()> {
+    let surface = Surface::new(mesh, |v| matches!(regions[v], Region::Face | Region::Eyelid | Region::Body));
+    for (i, t) in brows::LANDMARKS.into_iter().enumerate() {
+        let at = brows::line(t);
+        for (landmark, side) in [(22 + i, 1.0), (21 - i, -1.0)] {
+            let hit = brows::on_front(&surface, Vec2::new(at.x * side, at.y)).context("the brow's line misses the face")?;
+            ibug68[landmark] = surface.position(&hit);
+        }
+    }
+    Ok(())
+}
+
 /// Which lip each vertex is nearer to along the skin.
 fn lip_sides(mesh: &Mesh, ibug68: &[Vec3; NUM_IBUG]) -> Vec<Lip> {
     let graph = autorig::edge_graph(mesh);
@@ -193,34 +211,6 @@ fn lip_sides(mesh: &Mesh, ibug68: &[Vec3; NUM_IBUG]) -> Vec<Lip> {
     let upper = autorig::distances(&graph, &starts(&[49, 50, 51, 52, 53, 61, 62, 63]), f32::INFINITY);
     let lower = autorig::distances(&graph, &starts(&[55, 56, 57, 58, 59, 65, 66, 67]), f32::INFINITY);
     upper.iter().zip(&lower).map(|(u, l)| if u <= l { Lip::Upper } else { Lip::Lower }).collect()
-}
-
-struct Lids {
-    fields: [[Vec<f32>; 2]; 2],
-    degrees: [[f32; 2]; 2],
-    points: [[Vec3; 2]; 2],
-}
-
-fn lid_fields(mesh: &Mesh, regions: &[Region], eyes: [Eyeball; 2], ibug68: &[Vec3; NUM_IBUG]) -> Lids {
-    let blink = [shape("eyeBlinkLeft"), shape("eyeBlinkRight")];
-    let margins = [[[43, 44], [46, 47]], [[37, 38], [40, 41]]];
-    let mut largest = 0.0_f32;
-    let graph = autorig::edge_graph(mesh);
-    let mut points = [[Vec3::ZERO; 2]; 2];
-    let fields = [0, 1].map(|s| {
-        let angles = weights::turn_angles(&mesh.positions, &mesh.morphs[blink[s]], eyes[s].centre, 0.01);
-        let top = angles.iter().copied().fold(0.0, f32::max);
-        largest = largest.max(top);
-        for k in 0..2 {
-            let middle = (ibug68[margins[s][k][0]] + ibug68[margins[s][k][1]]) * 0.5;
-            points[s][k] = mesh.positions[autorig::nearest(&mesh.positions, middle, |v| regions[v] != Region::Socket) as usize];
-        }
-        let upper = angles.iter().map(|angle| (angle / top).clamp(0.0, 1.0)).collect();
-        let start = autorig::nearest(&mesh.positions, points[s][1], |_| true);
-        let lower = autorig::distances(&graph, &[start], 0.02).into_iter().map(|d| 0.8 * autorig::wendland(d / 0.014)).collect();
-        [upper, lower]
-    });
-    Lids { fields, degrees: [[largest.to_degrees(), -6.0], [-3.0, 4.0]], points }
 }
 
 /// Tangents along +u with handedness, per vertex, from the area-weighted UV gradients of its triangles.

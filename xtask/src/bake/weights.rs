@@ -2,11 +2,12 @@
 //! automatic rig, neck and shoulders by height.
 
 use super::autorig::{self, Feature};
-use super::bust::{Eyeball, Region};
+use super::bust::Region;
+use super::fit::{self, Mover};
 use super::mesh::Mesh;
 use super::part::Binding;
 use super::rig::{HEAD, ROOT, Rig, Zone};
-use glam::Vec3;
+use glam::{Vec3, Vec3Swizzles};
 use rhytid_shared::ARKIT_NAMES;
 
 /// Which side of the mouth a vertex is on.
@@ -26,10 +27,12 @@ pub struct Skin<'a> {
     pub regions: &'a [Region],
     /// Side of the mouth of every vertex.
     pub lips: &'a [Lip],
-    /// Eyes, left and right.
-    pub eyes: [Eyeball; 2],
     /// Share of the jaw's turn of every vertex.
     pub jaw: Vec<f32>,
+    /// Hinge of the jaw.
+    pub jaw_pivot: Vec3,
+    /// Angle of the shape `jawOpen`, radians.
+    pub jaw_open: f32,
     /// Share of each lid's turn: `lids[left, right][upper, lower]`.
     pub lids: [[Vec<f32>; 2]; 2],
 }
@@ -61,12 +64,39 @@ pub fn turn_angles(positions: &[Vec3], deltas: &[Vec3], pivot: Vec3, least_radiu
         .collect()
 }
 
-use glam::Vec3Swizzles;
-
 /// Weights by all rules.
 pub fn build(skin: &Skin<'_>, rig: &Rig) -> Weights {
-    let num_vertices = skin.mesh.positions.len();
     let graph = autorig::edge_graph(skin.mesh);
+    let fields = skin_fields(skin, rig, &graph);
+    let jaw = rig.joint_of("jaw");
+    let lid_joints = [["lid_upper_l", "lid_lower_l"], ["lid_upper_r", "lid_lower_r"]].map(|pair| pair.map(|name| rig.joint_of(name)));
+    (0..skin.mesh.positions.len())
+        .map(|v| {
+            let mut weights: Vec<(u8, f32)> = Vec::new();
+            let mut left = 1.0;
+            for (joints, lids) in lid_joints.iter().zip(&skin.lids) {
+                for (&joint, lid) in joints.iter().zip(lids) {
+                    let weight = lid[v].clamp(0.0, left);
+                    weights.push((joint, weight));
+                    left -= weight;
+                }
+            }
+            let joints = rig.reaches.iter().map(|reach| reach.joint).chain([jaw]);
+            let taken: f32 = fields.iter().map(|field| field[v]).sum::<f32>();
+            weights.extend(joints.zip(&fields).map(|(joint, field)| (joint, field[v] * left / taken.max(1.0))));
+            left *= (1.0 - taken).max(0.0);
+            let on_head = headness(skin.mesh.positions[v]);
+            weights.push((HEAD, left * on_head));
+            weights.push((ROOT, left * (1.0 - on_head)));
+            weights.retain(|&(_, weight)| weight > 0.0);
+            weights
+        })
+        .collect()
+}
+
+/// Weights of the skin bones and, last, of the jaw: automatic rig first, then fitted to the shapes, then smoothed.
+fn skin_fields(skin: &Skin<'_>, rig: &Rig, graph: &[Vec<(u32, f32)>]) -> Vec<Vec<f32>> {
+    let num_vertices = skin.mesh.positions.len();
     let features: Vec<Feature> = rig.reaches.iter().map(|reach| Feature { vertex: reach.vertex, reach: reach.reach }).collect();
     let allows = |j: usize, v: usize| {
         let is_lined = matches!(skin.regions[v], Region::Socket | Region::Cap);
@@ -76,41 +106,26 @@ pub fn build(skin: &Skin<'_>, rig: &Rig) -> Weights {
             Zone::LowerLip => !is_lined && skin.lips[v] == Lip::Lower,
         }
     };
-    let mut influences = autorig::influences(&graph, &features, allows);
-    for influence in &mut influences {
-        autorig::smooth(&graph, influence, 2, |a, b| skin.lips[a] == skin.lips[b] && skin.regions[a] != Region::Socket && skin.regions[b] != Region::Socket);
+    let influences = autorig::influences(graph, &features, allows);
+    let mut movers: Vec<Mover> =
+        rig.reaches.iter().map(|reach| Mover::Skin { vertex: reach.vertex, turns: reach.zone == Zone::LowerLip }).collect();
+    movers.push(Mover::Jaw { pivot: skin.jaw_pivot });
+    let shapes = fit::fitted_shapes();
+    let mut fields = vec![vec![0.0; num_vertices]; movers.len()];
+    for v in 0..num_vertices {
+        let raw: Vec<f32> = influences.iter().map(|influence| influence[v]).collect();
+        let mut prior = autorig::shares(&raw);
+        let left = 1.0 - prior.iter().sum::<f32>();
+        prior.push((skin.jaw[v] * left.max(0.0)).max(if skin.jaw[v] > 0.0 { 1e-6 } else { 0.0 }));
+        for (field, weight) in fields.iter_mut().zip(fit::fit(skin.mesh, &shapes, skin.jaw_open, v, &movers, &prior)) {
+            field[v] = weight;
+        }
     }
-    let jaw = rig.joint_of("jaw");
-    let lid_joints = [["lid_upper_l", "lid_lower_l"], ["lid_upper_r", "lid_lower_r"]].map(|pair| pair.map(|name| rig.joint_of(name)));
-    (0..num_vertices)
-        .map(|v| {
-            let mut weights: Vec<(u8, f32)> = Vec::new();
-            let mut left = 1.0;
-            for (joints, fields) in lid_joints.iter().zip(&skin.lids) {
-                for (&joint, field) in joints.iter().zip(fields) {
-                    let weight = field[v].clamp(0.0, left);
-                    weights.push((joint, weight));
-                    left -= weight;
-                }
-            }
-            let raw: Vec<f32> = influences.iter().map(|influence| influence[v]).collect();
-            let mut skin_share = 0.0;
-            for (share, reach) in autorig::shares(&raw).into_iter().zip(&rig.reaches) {
-                weights.push((reach.joint, share * left));
-                skin_share += share;
-            }
-            left *= (1.0 - skin_share).max(0.0);
-            let jaw_share = skin.jaw[v] * left;
-            weights.push((jaw, jaw_share));
-            left -= jaw_share;
-            let on_head = headness(skin.mesh.positions[v]);
-            weights.push((HEAD, left * on_head));
-            weights.push((ROOT, left * (1.0 - on_head)));
-            // What does not turn with the head takes no face bones either; the fields end above it anyway.
-            weights.retain(|&(_, weight)| weight > 0.0);
-            weights
-        })
-        .collect()
+    let is_same = |a: usize, b: usize| skin.lips[a] == skin.lips[b] && (skin.regions[a] == Region::Socket) == (skin.regions[b] == Region::Socket);
+    for field in &mut fields {
+        autorig::smooth(graph, field, 2, is_same);
+    }
+    fields
 }
 
 fn headness(p: Vec3) -> f32 {
