@@ -1,0 +1,126 @@
+//! Where a server is.
+
+use rhytid_shared::RoomName;
+use std::fmt;
+use std::str::FromStr;
+use tungstenite::http::Uri;
+
+/// Port of a server that says nothing else.
+const DEFAULT_PORT: u16 = 7878;
+
+/// Host and port of a server, written `ws://HOST[:PORT]`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ServerAddress {
+    /// Name or address; IPv6 in brackets.
+    host: String,
+    port: u16,
+}
+
+/// An address that is none.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum AddressError {
+    /// Not of the form.
+    #[error("server address {got:?} is not ws://HOST[:PORT]")]
+    Form {
+        /// What was given.
+        got: String,
+    },
+    /// Encrypted, which this client does not speak.
+    #[error(
+        "server address {got:?} asks for TLS, which this viewer does not speak; use ws://HOST[:PORT], through a tunnel where the way is not safe"
+    )]
+    Encrypted {
+        /// What was given.
+        got: String,
+    },
+}
+
+impl ServerAddress {
+    /// The socket of a room's viewers.
+    pub(super) fn view_uri(&self, room: &RoomName) -> String {
+        format!("{self}/v1/rooms/{room}/view")
+    }
+
+    /// A path on the same server over HTTP. `path` must begin with a slash.
+    pub(super) fn http_url(&self, path: &str) -> String {
+        format!("http://{}:{}{path}", self.host, self.port)
+    }
+
+    /// As `ToSocketAddrs` wants it: IPv6 without its brackets.
+    pub(super) fn host_and_port(&self) -> (&str, u16) {
+        (self.host.trim_start_matches('[').trim_end_matches(']'), self.port)
+    }
+}
+
+impl fmt::Display for ServerAddress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "ws://{}:{}", self.host, self.port)
+    }
+}
+
+impl FromStr for ServerAddress {
+    type Err = AddressError;
+
+    fn from_str(text: &str) -> Result<Self, AddressError> {
+        let form = || AddressError::Form { got: text.to_owned() };
+        let uri: Uri = text.parse().map_err(|_| form())?;
+        match uri.scheme_str() {
+            Some("ws") => {}
+            Some("wss" | "https") => return Err(AddressError::Encrypted { got: text.to_owned() }),
+            _ => return Err(form()),
+        }
+        let authority = uri.authority().ok_or_else(form)?;
+        // `Uri` takes users, empty ports, paths and queries as well; none of them means anything here.
+        let rest = text.strip_prefix("ws://").unwrap_or_default();
+        let is_plain =
+            rest.strip_suffix('/').unwrap_or(rest) == authority.as_str() && !rest.contains('@') && !authority.as_str().ends_with(':');
+        if !is_plain || authority.host().is_empty() {
+            return Err(form());
+        }
+        let port = match authority.port() {
+            None => DEFAULT_PORT,
+            Some(port) => port.as_str().parse().ok().filter(|&port| port != 0).ok_or_else(form)?,
+        };
+        Ok(Self { host: authority.host().to_owned(), port })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_read_and_completed() {
+        for (text, want) in [
+            ("ws://127.0.0.1:7878", "ws://127.0.0.1:7878"),
+            ("ws://face.example/", "ws://face.example:7878"),
+            ("ws://[::1]:80", "ws://[::1]:80"),
+        ] {
+            assert_eq!(text.parse::<ServerAddress>().map(|address| address.to_string()), Ok(want.to_owned()));
+        }
+        let address: ServerAddress = "ws://[::1]:80".parse().unwrap();
+        assert_eq!(address.host_and_port(), ("::1", 80));
+        assert_eq!(address.view_uri(&RoomName::new("demo").unwrap()), "ws://[::1]:80/v1/rooms/demo/view");
+        assert_eq!(address.http_url("/characters/a.glb"), "http://[::1]:80/characters/a.glb");
+    }
+
+    #[test]
+    fn wrong_addresses_are_refused_with_the_form_expected() {
+        for text in [
+            "",
+            "127.0.0.1:7878",
+            "http://host",
+            "ws://",
+            "ws://host:",
+            "ws://host:0",
+            "ws://host:99999",
+            "ws://host/v1",
+            "ws://a@host",
+            "ws://host?x=1",
+        ] {
+            let error = text.parse::<ServerAddress>().unwrap_err();
+            assert!(error.to_string().contains("ws://HOST[:PORT]"), "{text}: {error}");
+        }
+        assert!(matches!("wss://host".parse::<ServerAddress>(), Err(AddressError::Encrypted { .. })));
+    }
+}

@@ -1,0 +1,165 @@
+//! A viewer without a picture: link and playout together, and in plain words how things stand.
+
+use crate::link::{CharacterSource, Link, LinkOptions, LinkState, LinkStats, ServerAddress};
+use crate::playout::{Playout, PlayoutState, PlayoutStats};
+use crate::renderer::RenderFrame;
+use rhytid_shared::{Character, RoomName};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Whom to watch.
+#[derive(Debug, Clone, PartialEq, Eq, clap::Args)]
+pub struct WatchArgs {
+    /// The server
+    #[arg(default_value = "ws://127.0.0.1:7878", value_name = "ws://HOST[:PORT]")]
+    pub server: ServerAddress,
+    /// The room
+    #[arg(long, default_value = "demo", value_parser = RoomName::new)]
+    pub room: RoomName,
+}
+
+/// Watches one room: takes what the link brings, keeps the playout, says what is the matter.
+#[derive(Debug)]
+pub struct Spectator {
+    link: Link,
+    playout: Playout,
+    character: Arc<Character>,
+    server: ServerAddress,
+    room: RoomName,
+    /// Zero of the playout's time.
+    started_at: Instant,
+    /// Why the server's character cannot be drawn.
+    unusable: Option<String>,
+}
+
+/// How things stand, the most urgent first to know.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum StatusKind {
+    /// On the way to the server.
+    Connecting,
+    /// Connected; nobody publishes yet.
+    Waiting,
+    /// The face moves.
+    Live,
+    /// The tracker sees no face.
+    FaceLost,
+    /// Nothing comes any more; the face eases to neutral.
+    Silent,
+    /// Nothing has come for a while; the face is at rest.
+    Idle,
+    /// The server is not there; the link tries again.
+    ServerGone,
+    /// The server does not want this viewer.
+    Refused,
+    /// The server animates a character that cannot be drawn.
+    Unusable,
+}
+
+/// How things stand, for people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Status {
+    /// For programs.
+    pub kind: StatusKind,
+    /// Two or three words.
+    pub headline: &'static str,
+    /// One sentence.
+    pub detail: String,
+}
+
+impl Spectator {
+    /// Starts watching. `character` is the one that is there already; `wake` is called on the link's thread whenever
+    /// something came.
+    pub fn open(watch: WatchArgs, character: Arc<Character>, wake: impl Fn() + Send + 'static) -> Self {
+        let WatchArgs { server, room } = watch;
+        let options = LinkOptions { server: server.clone(), room: room.clone(), known_sha256: Some(character.sha256.clone()) };
+        Self {
+            link: Link::open(options, wake),
+            playout: Playout::new(&character),
+            character,
+            server,
+            room,
+            started_at: Instant::now(),
+            unusable: None,
+        }
+    }
+
+    /// Takes what has come. Where the server animates another character, `load` gets its `.glb` and makes it drawable.
+    pub fn update(&mut self, mut load: impl FnMut(&[u8]) -> Result<Arc<Character>, String>) {
+        let news = self.link.take_news();
+        if let Some(connected) = news.connected {
+            self.playout.reconnected(self.time(Instant::now()));
+            if let CharacterSource::Fetched(glb) = connected.character {
+                match load(&glb) {
+                    Ok(character) => {
+                        self.playout = Playout::new(&character);
+                        self.character = character;
+                        self.unusable = None;
+                    }
+                    Err(problem) => self.unusable = Some(problem),
+                }
+            }
+        }
+        for arrival in news.frames {
+            self.playout.push(&arrival.frame, self.time(arrival.received_at));
+        }
+    }
+
+    /// The face to draw at `now`.
+    pub fn sample(&mut self, now: Instant) -> &RenderFrame {
+        let now = self.time(now);
+        self.playout.sample(now)
+    }
+
+    /// How things stand at `now`, as of the last [`Spectator::sample`].
+    pub fn status(&self, now: Instant) -> Status {
+        let Self { server, room, .. } = self;
+        let status = |kind, headline, detail| Status { kind, headline, detail };
+        match (self.link.state(), self.playout.state()) {
+            (LinkState::Refused { message }, _) => status(StatusKind::Refused, "Refused", message),
+            (LinkState::Connecting, _) => status(StatusKind::Connecting, "Connecting", format!("Looking for {server}")),
+            (LinkState::Lost { why, retry_at, .. }, _) => {
+                let left = retry_at.saturating_duration_since(now).as_secs_f32().ceil();
+                let next = if left > 0.0 { format!("trying again in {left} s") } else { "trying again".into() };
+                status(StatusKind::ServerGone, "Server gone", format!("{server}: {why}; {next}"))
+            }
+            (LinkState::Live, _) if self.unusable.is_some() => {
+                status(StatusKind::Unusable, "Cannot draw this character", self.unusable.clone().unwrap_or_default())
+            }
+            (LinkState::Live, PlayoutState::Waiting) => {
+                status(StatusKind::Waiting, "Waiting for a face", format!("Nobody publishes to room {room} of {server} yet"))
+            }
+            (LinkState::Live, PlayoutState::Live) => status(StatusKind::Live, "Live", format!("Room {room} of {server}")),
+            (LinkState::Live, PlayoutState::FaceLost) => {
+                status(StatusKind::FaceLost, "Face lost", "The tracker is there but sees no face".into())
+            }
+            (LinkState::Live, PlayoutState::Silent) => status(StatusKind::Silent, "Sender silent", "No frame has come for a moment".into()),
+            (LinkState::Live, PlayoutState::Idle) => {
+                status(StatusKind::Idle, "Sender gone", format!("Waiting for somebody to publish to room {room}"))
+            }
+        }
+    }
+
+    /// True while the next picture may differ from the last.
+    pub fn is_moving(&self) -> bool {
+        self.playout.is_moving()
+    }
+
+    /// What the link counted.
+    pub fn link_stats(&self) -> LinkStats {
+        self.link.stats()
+    }
+
+    /// What playout measured.
+    pub fn playout_stats(&self) -> PlayoutStats {
+        self.playout.stats()
+    }
+
+    /// The room watched.
+    pub fn room(&self) -> &RoomName {
+        &self.room
+    }
+
+    fn time(&self, at: Instant) -> Duration {
+        at.saturating_duration_since(self.started_at)
+    }
+}

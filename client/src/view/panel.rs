@@ -1,0 +1,274 @@
+//! What stands round the face: status, switches, numbers, coefficients.
+
+use super::look::{self, ACCENT, BAD, FAINT, GOOD, PANEL, TEXT, WARN, WELL};
+use super::rates::Rate;
+use super::switches::{Switches, views};
+use crate::link::LinkStats;
+use crate::playout::PlayoutStats;
+use crate::renderer::{BlendMode, RenderFrame, ViewMode};
+use crate::spectator::{Status, StatusKind};
+use egui::{Align2, Color32, CornerRadius, FontId, Frame, Margin, Pos2, Rect, RichText, Sense, Ui, pos2, vec2};
+use rhytid_shared::Character;
+
+/// Width of the panel, points.
+const PANEL_WIDTH: f32 = 288.0;
+/// Height of a pose's bars, points.
+const BARS_HEIGHT: f32 = 34.0;
+
+/// What the panel shows. Changes nothing but the switches.
+pub(crate) struct Scene<'a> {
+    pub(crate) character: &'a Character,
+    pub(crate) frame: &'a RenderFrame,
+    pub(crate) status: &'a Status,
+    pub(crate) room: &'a str,
+    pub(crate) link: LinkStats,
+    pub(crate) playout: PlayoutStats,
+    pub(crate) rates: &'a Rates,
+    /// What draws.
+    pub(crate) adapter: &'a str,
+    /// The face's picture; drawn into after the layout is known.
+    pub(crate) face: egui::TextureId,
+}
+
+/// The rates shown.
+#[derive(Debug, Default)]
+pub(crate) struct Rates {
+    pub(crate) pictures: Rate,
+    pub(crate) packets: Rate,
+    pub(crate) bytes: Rate,
+}
+
+/// Lays everything out and obeys the pointer and the keys. Returns where the face goes, points.
+pub(crate) fn show(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) -> Rect {
+    ui.input_mut(|input| switches.obey_keys(input, scene.character));
+    if switches.has_panel {
+        let frame = Frame::new().fill(PANEL).inner_margin(Margin { left: 18, right: 18, top: 16, bottom: 12 });
+        egui::Panel::right("panel").exact_size(PANEL_WIDTH).resizable(false).show_separator_line(false).frame(frame).show(ui, |ui| {
+            egui::Panel::bottom("keys")
+                .show_separator_line(false)
+                .frame(Frame::new().inner_margin(Margin { top: 8, ..Margin::ZERO }))
+                .show(ui, key_help);
+            egui::CentralPanel::no_frame().show(ui, |ui| {
+                egui::ScrollArea::vertical().auto_shrink(false).show(ui, |ui| contents(ui, scene, switches));
+            });
+        });
+    }
+    egui::CentralPanel::no_frame().show(ui, |ui| face(ui, scene, switches)).inner
+}
+
+fn face(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) -> Rect {
+    let rect = ui.max_rect();
+    let response = ui.interact(rect, ui.scope_id().with("face"), Sense::click_and_drag());
+    if response.dragged() {
+        switches.drag(response.drag_delta(), rect.height());
+    }
+    if response.double_clicked() {
+        switches.reset_camera(scene.character);
+    }
+    if response.contains_pointer() {
+        let scrolled = ui.input(|input| input.smooth_scroll_delta().y + (input.zoom_delta().ln() * 500.0));
+        if scrolled != 0.0 {
+            switches.scroll(scrolled);
+        }
+    }
+    let whole = Rect::from_min_max(pos2(0.0, 0.0), pos2(1.0, 1.0));
+    ui.painter().image(scene.face, rect, whole, Color32::WHITE);
+    if switches.draw.view == ViewMode::Split {
+        split_captions(ui, rect);
+    }
+    if scene.status.kind == StatusKind::Live {
+        if !switches.has_panel {
+            pill(ui, rect, scene);
+        }
+    } else {
+        banner(ui, rect, scene.status);
+    }
+    rect
+}
+
+fn split_captions(ui: &Ui, rect: Rect) {
+    let painter = ui.painter();
+    let y = rect.top() + 22.0;
+    let font = FontId::proportional(12.5);
+    painter.text(pos2(rect.center().x - 14.0, y), Align2::RIGHT_CENTER, "with wrinkles", font.clone(), TEXT.gamma_multiply(0.8));
+    painter.text(pos2(rect.center().x + 14.0, y), Align2::LEFT_CENTER, "without", font, TEXT.gamma_multiply(0.8));
+}
+
+/// What says that all is well, where there is no panel to say it.
+fn pill(ui: &Ui, rect: Rect, scene: &Scene<'_>) {
+    let at = rect.left_top() + vec2(22.0, 22.0);
+    ui.painter().circle_filled(at, 4.0, GOOD);
+    let text = format!("{} · room {}", scene.status.headline, scene.room);
+    ui.painter().text(at + vec2(12.0, 0.0), Align2::LEFT_CENTER, text, FontId::proportional(13.0), TEXT.gamma_multiply(0.85));
+}
+
+/// What is the matter, large.
+fn banner(ui: &Ui, rect: Rect, status: &Status) {
+    let painter = ui.painter();
+    let width = (rect.width() - 48.0).clamp(80.0, 560.0);
+    let headline = painter.layout(status.headline.to_owned(), FontId::proportional(32.0), TEXT, width - 56.0);
+    let detail = painter.layout(status.detail.clone(), FontId::proportional(15.0), Color32::from_gray(0xc8), width - 56.0);
+    let size = vec2(width, headline.size().y + detail.size().y + 44.0);
+    let top_left = pos2(rect.center().x - 0.5 * width, rect.bottom() - size.y - (0.06 * rect.height()).max(12.0));
+    let card = Rect::from_min_size(top_left, size);
+    painter.rect_filled(card, CornerRadius::same(12), Color32::from_rgba_unmultiplied(0x12, 0x13, 0x15, 0xe0));
+    let stripe = Rect::from_min_size(card.left_top() + vec2(16.0, 20.0), vec2(5.0, size.y - 40.0));
+    painter.rect_filled(stripe, CornerRadius::same(3), color_of(status.kind));
+    let text_at = card.left_top() + vec2(36.0, 18.0);
+    let below = text_at + vec2(0.0, headline.size().y + 6.0);
+    painter.galley(text_at, headline, TEXT);
+    painter.galley(below, detail, TEXT);
+}
+
+fn color_of(kind: StatusKind) -> Color32 {
+    match kind {
+        StatusKind::Live => GOOD,
+        StatusKind::FaceLost | StatusKind::Silent => WARN,
+        StatusKind::ServerGone | StatusKind::Refused | StatusKind::Unusable => BAD,
+        StatusKind::Connecting | StatusKind::Waiting | StatusKind::Idle => Color32::from_gray(0x8c),
+    }
+}
+
+fn contents(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) {
+    ui.label(RichText::new("Rhytid").size(24.0).color(TEXT));
+    ui.horizontal(|ui| {
+        let (dot, _) = ui.allocate_exact_size(vec2(10.0, 14.0), Sense::hover());
+        ui.painter().circle_filled(dot.center() + vec2(0.0, 1.0), 4.5, color_of(scene.status.kind));
+        ui.label(RichText::new(scene.status.headline).color(TEXT).strong());
+        ui.label(RichText::new(format!("room {}", scene.room)).color(FAINT));
+    });
+
+    look::section(ui, "View");
+    view_switches(ui, scene.character, switches);
+
+    look::section(ui, "Wrinkles");
+    wrinkle_switches(ui, switches);
+
+    look::section(ui, "Link");
+    numbers(ui, scene);
+
+    look::section(ui, "Reference poses");
+    for (k, pose) in scene.character.poses.iter().enumerate() {
+        pose_bars(ui, scene, k, &pose.name);
+    }
+    if scene.character.poses.is_empty() {
+        ui.label(RichText::new("This character has none.").color(FAINT));
+    }
+}
+
+fn view_switches(ui: &mut Ui, character: &Character, switches: &mut Switches) {
+    let width = (ui.available_width() - 2.0 * ui.spacing().item_spacing.x) / 3.0;
+    let is_on = |view: ViewMode, on: ViewMode| std::mem::discriminant(&view) == std::mem::discriminant(&on);
+    for row in views(switches.pose).chunks(3) {
+        ui.horizontal(|ui| {
+            for &(view, name) in row {
+                let button = look::switch(name, is_on(view, switches.draw.view)).min_size(vec2(width, 28.0));
+                if ui.add(button).clicked() {
+                    switches.choose_view(view, character);
+                }
+            }
+        });
+    }
+    if let ViewMode::Influence(shown) = switches.draw.view {
+        ui.horizontal_wrapped(|ui| {
+            let of_one = character.poses.iter().enumerate().map(|(k, pose)| (Some(k), pose.name.as_str()));
+            for (pose, name) in std::iter::once((None, "all poses")).chain(of_one) {
+                if ui.add(look::switch(name, shown == pose).small()).clicked() {
+                    switches.choose_pose(pose);
+                }
+            }
+        });
+    }
+}
+
+fn wrinkle_switches(ui: &mut Ui, switches: &mut Switches) {
+    let width = ui.available_width();
+    let label = if switches.draw.wrinkles { "Wrinkles on" } else { "Wrinkles off" };
+    if ui.add(look::switch(label, switches.draw.wrinkles).min_size(vec2(width, 28.0))).clicked() {
+        switches.draw.wrinkles = !switches.draw.wrinkles;
+    }
+    let width = (width - 2.0 * ui.spacing().item_spacing.x) / 3.0;
+    ui.horizontal(|ui| {
+        for mode in BlendMode::ALL {
+            let (name, hint) = match mode {
+                BlendMode::PartialDerivatives => ("Derivatives", "Sum of partial derivatives (Jimenez et al. 2011)"),
+                BlendMode::Simple => ("Simple", "Mean of whole normals (Dutreve et al. 2009, 5.3)"),
+                BlendMode::Printed => ("Printed", "The formula as Dutreve et al. 2009 print it, with a rest term"),
+            };
+            if ui.add(look::switch(name, switches.draw.blend == mode).min_size(vec2(width, 28.0))).on_hover_text(hint).clicked() {
+                switches.draw.blend = mode;
+            }
+        }
+    });
+}
+
+fn numbers(ui: &mut Ui, scene: &Scene<'_>) {
+    let millis = |time: std::time::Duration| format!("{:.0} ms", time.as_secs_f64() * 1e3);
+    let (link, playout, rates) = (&scene.link, &scene.playout, scene.rates);
+    // Half the way there and back, and what playout adds; the sender's own clock cannot be compared with ours.
+    let latency = link.round_trip.map_or_else(|| "–".into(), |way| millis(way / 2 + playout.delay));
+    let rows = [
+        ("Pictures", format!("{:.0} /s", rates.pictures.per_second()), "Pictures drawn a second"),
+        ("Packets", format!("{:.0} /s", rates.packets.per_second()), "Frame packets received a second"),
+        ("Bytes", bytes_a_second(rates.bytes.per_second()), "Payload of frame packets a second"),
+        ("Latency", latency, "Server to screen: half a round trip and the playout delay"),
+        ("Playout delay", millis(playout.delay), "How much later than possible the face is shown, so that it moves evenly"),
+        ("Jitter", millis(playout.jitter), "95 % of packets are late by no more than this"),
+        ("Skipped", (playout.late + playout.duplicates + link.garbage).to_string(), "Packets that came late, twice, or broken"),
+    ];
+    for (name, value, hint) in rows {
+        let row = ui.horizontal(|ui| {
+            ui.label(RichText::new(name).color(FAINT));
+            ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| ui.label(RichText::new(value).color(TEXT)));
+        });
+        row.response.on_hover_text(hint);
+    }
+    ui.label(RichText::new(scene.adapter).small().color(FAINT));
+}
+
+fn bytes_a_second(rate: f64) -> String {
+    if rate < 10_000.0 { format!("{rate:.0} B/s") } else { format!("{:.1} kB/s", rate / 1e3) }
+}
+
+/// One pose: its name, how strong it is at most, and one bar a bone.
+fn pose_bars(ui: &mut Ui, scene: &Scene<'_>, k: usize, name: &str) {
+    let num_bones = scene.character.num_bones();
+    let row = scene.frame.influences.get(k * num_bones..(k + 1) * num_bones).unwrap_or_default();
+    let most = row.iter().copied().fold(0.0, f32::max);
+    ui.horizontal(|ui| {
+        ui.label(RichText::new(name).color(TEXT));
+        ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| {
+            ui.label(RichText::new(format!("{:.0} %", 100.0 * most)).color(if most > 0.05 { ACCENT } else { FAINT }));
+        });
+    });
+    let (rect, response) = ui.allocate_exact_size(vec2(ui.available_width(), BARS_HEIGHT), Sense::hover());
+    ui.painter().rect_filled(rect, CornerRadius::same(5), WELL);
+    let inner = rect.shrink2(vec2(6.0, 5.0));
+    let step = inner.width() / num_bones.max(1) as f32;
+    let bar_of = |i: usize, value: f32| {
+        let left = inner.left() + step * i as f32;
+        Rect::from_min_max(
+            pos2(left, inner.bottom() - (value * inner.height()).max(1.0)),
+            pos2(left + (step - 1.5).max(1.0), inner.bottom()),
+        )
+    };
+    for (i, &value) in row.iter().enumerate() {
+        // Bones that this pose does not move are marked by nothing at all.
+        if scene.character.poses[k].points[i] != scene.character.bones[i].rest {
+            let color = if value > 0.0 { ACCENT } else { FAINT.gamma_multiply(0.6) };
+            ui.painter().rect_filled(bar_of(i, value), CornerRadius::same(1), color);
+        }
+    }
+    if let Some(Pos2 { x, .. }) = response.hover_pos() {
+        let i = (((x - inner.left()) / step).max(0.0) as usize).min(num_bones.saturating_sub(1));
+        if let (Some(bone), Some(value)) = (scene.character.bones.get(i), row.get(i)) {
+            response.on_hover_text_at_pointer(format!("{}  {:.0} %", bone.name, 100.0 * value));
+        }
+    }
+    ui.add_space(4.0);
+}
+
+fn key_help(ui: &mut Ui) {
+    let text = "1–6 view   W wrinkles   B blend   H panel\nF full screen   R camera   Esc quit\nDrag to turn, wheel to zoom";
+    ui.label(RichText::new(text).small().color(FAINT));
+}

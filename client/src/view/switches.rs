@@ -1,0 +1,116 @@
+//! What the person before the window has chosen.
+
+use crate::renderer::{BlendMode, Camera, DrawSettings, ViewMode};
+use egui::{Key, Modifiers};
+use rhytid_shared::Character;
+
+/// The state of all switches.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Switches {
+    /// What is drawn and how.
+    pub(crate) draw: DrawSettings,
+    /// The pose the influence view shows, all where `None`; kept while another view is on.
+    pub(crate) pose: Option<usize>,
+    /// The panel is there.
+    pub(crate) has_panel: bool,
+    /// The window fills the screen.
+    pub(crate) is_full_screen: bool,
+    /// The window shall close.
+    pub(crate) is_quitting: bool,
+}
+
+/// Radians the camera turns for a drag over the height of the picture.
+const ORBIT_PER_HEIGHT: f32 = 3.5;
+/// Share by which one notch (50 points) of the wheel brings the camera nearer.
+const ZOOM_PER_POINT: f32 = 0.002;
+
+/// The views that have a key of their own, in the order of the keys 1 to 6.
+pub(crate) fn views(pose: Option<usize>) -> [(ViewMode, &'static str); 6] {
+    [
+        (ViewMode::Beauty, "Beauty"),
+        (ViewMode::Bare, "Bare"),
+        (ViewMode::Split, "Split"),
+        (ViewMode::Influence(pose), "Influence"),
+        (ViewMode::Normals, "Normals"),
+        (ViewMode::Wireframe, "Wireframe"),
+    ]
+}
+
+impl Switches {
+    pub(crate) fn new(character: &Character) -> Self {
+        Self { draw: DrawSettings::new(Camera::front(character)), pose: None, has_panel: true, is_full_screen: false, is_quitting: false }
+    }
+
+    /// Obeys the keys of this frame.
+    pub(crate) fn obey_keys(&mut self, input: &mut egui::InputState, character: &Character) {
+        let mut pressed = |key| input.consume_key(Modifiers::NONE, key);
+        for (key, at) in [(Key::Num1, 0), (Key::Num2, 1), (Key::Num3, 2), (Key::Num4, 3), (Key::Num5, 4), (Key::Num6, 5)] {
+            if pressed(key) {
+                self.choose_view(views(self.pose)[at].0, character);
+            }
+        }
+        if pressed(Key::W) {
+            self.draw.wrinkles = !self.draw.wrinkles;
+        }
+        if pressed(Key::B) {
+            let at = BlendMode::ALL.iter().position(|&mode| mode == self.draw.blend).unwrap_or(0);
+            self.draw.blend = BlendMode::ALL[(at + 1) % BlendMode::ALL.len()];
+        }
+        if pressed(Key::H) {
+            self.has_panel = !self.has_panel;
+        }
+        if pressed(Key::F) {
+            self.is_full_screen = !self.is_full_screen;
+        }
+        if pressed(Key::R) {
+            self.reset_camera(character);
+        }
+        if pressed(Key::Escape) {
+            self.is_quitting = true;
+        }
+    }
+
+    /// Shows `view`; the influence view chosen again goes on to the next pose.
+    pub(crate) fn choose_view(&mut self, view: ViewMode, character: &Character) {
+        if matches!((view, self.draw.view), (ViewMode::Influence(_), ViewMode::Influence(_))) {
+            let next = self.pose.map_or(0, |pose| pose + 1);
+            self.pose = (next < character.num_poses()).then_some(next);
+            self.draw.view = ViewMode::Influence(self.pose);
+        } else {
+            self.draw.view = view;
+        }
+    }
+
+    /// Shows the influence of one pose, or of all.
+    pub(crate) fn choose_pose(&mut self, pose: Option<usize>) {
+        self.pose = pose;
+        self.draw.view = ViewMode::Influence(pose);
+    }
+
+    /// Turns the camera by a drag of `points` in a picture `height` points high.
+    pub(crate) fn drag(&mut self, points: egui::Vec2, height: f32) {
+        let turn = points * ORBIT_PER_HEIGHT / height.max(1.0);
+        // The face follows the pointer: the camera goes the other way.
+        self.draw.camera.orbit(-turn.x, turn.y);
+    }
+
+    /// Brings the camera nearer (`points` > 0) or farther.
+    pub(crate) fn scroll(&mut self, points: f32) {
+        self.draw.camera.zoom((-points * ZOOM_PER_POINT).exp());
+    }
+
+    pub(crate) fn reset_camera(&mut self, character: &Character) {
+        self.draw.camera = Camera::front(character);
+    }
+
+    /// Keeps what fits another character.
+    pub(crate) fn change_character(&mut self, character: &Character) {
+        self.reset_camera(character);
+        if self.pose.is_some_and(|pose| pose >= character.num_poses()) {
+            self.pose = None;
+        }
+        if let ViewMode::Influence(_) = self.draw.view {
+            self.draw.view = ViewMode::Influence(self.pose);
+        }
+    }
+}

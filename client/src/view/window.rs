@@ -1,0 +1,242 @@
+//! The window's GPU side: surface, device, renderer, panel.
+
+use super::WindowError;
+use super::look;
+use super::painter::Painter;
+use super::panel::{self, Scene};
+use super::switches::Switches;
+use crate::asset::CharacterAsset;
+use crate::renderer::{RenderError, RenderFrame, Renderer, read_back, required_limits};
+use image::RgbaImage;
+use std::sync::Arc;
+use winit::event::WindowEvent;
+use winit::event_loop::ActiveEventLoop;
+use winit::window::{Fullscreen, Window};
+
+/// The face is drawn into this, then put into the window by egui, which wants it so.
+const FACE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
+
+/// Everything that goes with one window.
+pub(super) struct GpuWindow {
+    window: Arc<Window>,
+    surface: wgpu::Surface<'static>,
+    surface_config: wgpu::SurfaceConfiguration,
+    adapter_name: String,
+    device: wgpu::Device,
+    queue: wgpu::Queue,
+    renderer: Renderer,
+    face: FaceTexture,
+    egui: egui_winit::State,
+    painter: Painter,
+}
+
+struct FaceTexture {
+    view: wgpu::TextureView,
+    size: [u32; 2],
+    id: egui::TextureId,
+}
+
+/// What became of a picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Drawn {
+    /// It is on the screen.
+    Shown,
+    /// The surface had changed; draw again.
+    Again,
+    /// Nobody can see the window now.
+    Hidden,
+}
+
+impl GpuWindow {
+    /// Opens a surface on `window` and uploads the character.
+    pub(super) fn new(event_loop: &ActiveEventLoop, window: Window, asset: &CharacterAsset) -> Result<Self, WindowError> {
+        let window = Arc::new(window);
+        let display = Box::new(event_loop.owned_display_handle());
+        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_with_display_handle_from_env(display));
+        let surface = instance.create_surface(Arc::clone(&window)).map_err(|error| WindowError::Surface(error.to_string()))?;
+        let adapter = pollster::block_on(wgpu::util::initialize_adapter_from_env_or_default(&instance, Some(&surface)))
+            .map_err(|error| RenderError::NoAdapter(error.to_string()))?;
+        let info = adapter.get_info();
+        let descriptor =
+            wgpu::DeviceDescriptor { label: Some("rhytid window"), required_limits: required_limits(&adapter), ..Default::default() };
+        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
+            .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
+
+        let size = window.inner_size();
+        let mut surface_config = surface
+            .get_default_config(&adapter, size.width.max(1), size.height.max(1))
+            .ok_or_else(|| WindowError::Surface(format!("adapter {:?} cannot draw to this display", info.name)))?;
+        // egui blends encoded colours; a format that does not encode by itself spares it the way there and back.
+        let formats = surface.get_capabilities(&adapter).formats;
+        if let Some(&format) =
+            formats.iter().find(|format| matches!(format, wgpu::TextureFormat::Bgra8Unorm | wgpu::TextureFormat::Rgba8Unorm))
+        {
+            surface_config.format = format;
+        }
+        surface_config.present_mode = wgpu::PresentMode::AutoVsync;
+        surface_config.desired_maximum_frame_latency = 2;
+        surface.configure(&device, &surface_config);
+        tracing::info!(adapter = info.name, backend = %info.backend, format = ?surface_config.format, "drawing in a window");
+
+        let context = egui::Context::default();
+        look::apply(&context);
+        let egui = egui_winit::State::new(
+            context,
+            egui::ViewportId::ROOT,
+            event_loop,
+            Some(window.scale_factor() as f32),
+            None,
+            Some(device.limits().max_texture_dimension_2d as usize),
+        );
+        let mut painter = Painter::new(&device, surface_config.format);
+        let renderer = Renderer::new(&device, &queue, asset, FACE_FORMAT);
+        let face = FaceTexture::new(&device, &mut painter, [1, 1], None);
+        Ok(Self { window, surface, surface_config, adapter_name: info.name, device, queue, renderer, face, egui, painter })
+    }
+
+    /// The window itself.
+    pub(super) fn window(&self) -> &Window {
+        &self.window
+    }
+
+    /// Lets egui have an event; true where the picture changes by it.
+    pub(super) fn on_event(&mut self, event: &WindowEvent) -> bool {
+        self.egui.on_window_event(&self.window, event).repaint
+    }
+
+    /// Follows the window's size.
+    pub(super) fn resize(&mut self, width: u32, height: u32) {
+        let most = self.device.limits().max_texture_dimension_2d;
+        (self.surface_config.width, self.surface_config.height) = (width.clamp(1, most), height.clamp(1, most));
+        self.surface.configure(&self.device, &self.surface_config);
+    }
+
+    /// Draws another character from now on.
+    pub(super) fn change_character(&mut self, asset: &CharacterAsset) {
+        self.renderer = Renderer::new(&self.device, &self.queue, asset, FACE_FORMAT);
+    }
+
+    /// What draws.
+    pub(super) fn adapter_name(&self) -> &str {
+        &self.adapter_name
+    }
+
+    /// egui's name of the face's picture.
+    pub(super) fn face_id(&self) -> egui::TextureId {
+        self.face.id
+    }
+
+    /// True while egui still animates something.
+    pub(super) fn is_panel_moving(&self) -> bool {
+        self.egui.egui_ctx().has_requested_repaint()
+    }
+
+    /// Lays out and draws one picture of the window, and shows it.
+    pub(super) fn draw(&mut self, scene: &Scene<'_>, switches: &mut Switches) -> Result<Drawn, WindowError> {
+        let (primitives, pixels_per_point, freed) = self.lay_out(scene, switches);
+        let (texture, is_suboptimal) = match self.surface.get_current_texture() {
+            wgpu::CurrentSurfaceTexture::Success(texture) => (texture, false),
+            wgpu::CurrentSurfaceTexture::Suboptimal(texture) => (texture, true),
+            wgpu::CurrentSurfaceTexture::Outdated | wgpu::CurrentSurfaceTexture::Lost => {
+                self.surface.configure(&self.device, &self.surface_config);
+                self.painter.free(&freed);
+                return Ok(Drawn::Again);
+            }
+            wgpu::CurrentSurfaceTexture::Timeout | wgpu::CurrentSurfaceTexture::Occluded => {
+                self.painter.free(&freed);
+                return Ok(Drawn::Hidden);
+            }
+            wgpu::CurrentSurfaceTexture::Validation => return Err(WindowError::Surface("the surface gave no picture to draw into".into())),
+        };
+        let view = texture.texture.create_view(&wgpu::TextureViewDescriptor::default());
+        let encoder = self.record(&view, &primitives, pixels_per_point, scene.frame, switches);
+        self.queue.submit([encoder.finish()]);
+        self.painter.free(&freed);
+        self.window.pre_present_notify();
+        self.queue.present(texture);
+        if is_suboptimal {
+            self.surface.configure(&self.device, &self.surface_config);
+        }
+        Ok(Drawn::Shown)
+    }
+
+    /// Draws the window's picture and returns it instead of showing it.
+    pub(super) fn screenshot(&mut self, scene: &Scene<'_>, switches: &mut Switches) -> Result<RgbaImage, WindowError> {
+        let (primitives, pixels_per_point, freed) = self.lay_out(scene, switches);
+        let size = [self.surface_config.width, self.surface_config.height];
+        let extent = wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 };
+        let texture = self.device.create_texture(&wgpu::TextureDescriptor {
+            label: Some("screenshot"),
+            size: extent,
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format: self.surface_config.format,
+            usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
+            view_formats: &[],
+        });
+        let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
+        let encoder = self.record(&view, &primitives, pixels_per_point, scene.frame, switches);
+        let mut picture = read_back(&self.device, &self.queue, encoder, &texture, size)?;
+        self.painter.free(&freed);
+        if matches!(self.surface_config.format, wgpu::TextureFormat::Bgra8Unorm | wgpu::TextureFormat::Bgra8UnormSrgb) {
+            picture.pixels_mut().for_each(|pixel| pixel.0.swap(0, 2));
+        }
+        // What lies behind the window does not belong to it.
+        picture.pixels_mut().for_each(|pixel| pixel.0[3] = 255);
+        Ok(picture)
+    }
+
+    fn lay_out(&mut self, scene: &Scene<'_>, switches: &mut Switches) -> (Vec<egui::ClippedPrimitive>, f32, egui::TexturesDelta) {
+        let was_full_screen = switches.is_full_screen;
+        let input = self.egui.take_egui_input(&self.window);
+        let context = self.egui.egui_ctx().clone();
+        let mut face_rect = egui::Rect::ZERO;
+        let output = context.run_ui(input, |ui| face_rect = panel::show(ui, scene, switches));
+        self.egui.handle_platform_output(&self.window, output.platform_output);
+        if switches.is_full_screen != was_full_screen {
+            self.window.set_fullscreen(switches.is_full_screen.then_some(Fullscreen::Borderless(None)));
+        }
+        let most = self.device.limits().max_texture_dimension_2d;
+        let pixels = |points: f32| ((points * output.pixels_per_point).round() as u32).clamp(1, most);
+        let face_size = [pixels(face_rect.width()), pixels(face_rect.height())];
+        if self.face.size != face_size {
+            self.face = FaceTexture::new(&self.device, &mut self.painter, face_size, Some(self.face.id));
+        }
+        self.painter.upload(&self.device, &self.queue, &output.textures_delta);
+        (context.tessellate(output.shapes, output.pixels_per_point), output.pixels_per_point, output.textures_delta)
+    }
+
+    fn record(
+        &mut self,
+        target: &wgpu::TextureView,
+        primitives: &[egui::ClippedPrimitive],
+        pixels_per_point: f32,
+        frame: &RenderFrame,
+        switches: &Switches,
+    ) -> wgpu::CommandEncoder {
+        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("window") });
+        self.renderer.draw(&self.device, &self.queue, &mut encoder, &self.face.view, self.face.size, &switches.draw, frame);
+        let size = [self.surface_config.width, self.surface_config.height];
+        self.painter.paint(&self.device, &self.queue, &mut encoder, target, size, pixels_per_point, primitives);
+        encoder
+    }
+}
+
+impl FaceTexture {
+    fn new(device: &wgpu::Device, painter: &mut Painter, size: [u32; 2], id: Option<egui::TextureId>) -> Self {
+        let texture = device.create_texture(&wgpu::TextureDescriptor {
+            label: Some("face in the window"),
+            size: wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 },
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format: FACE_FORMAT,
+            usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::TEXTURE_BINDING,
+            view_formats: &[],
+        });
+        let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
+        let id = painter.register(device, &view, id);
+        Self { view, size, id }
+    }
+}
