@@ -52,17 +52,30 @@ pub struct Feed<R = BufReader<File>> {
 impl Feed {
     /// Opens a feed file and reads its hello.
     pub fn open(path: &Path, character: &Character) -> Result<Self, FeedError> {
-        let shown = path.display().to_string();
-        let file = File::open(path).map_err(|source| FeedError::Io { path: shown.clone(), source })?;
-        Self::new(BufReader::with_capacity(1 << 16, file), shown, character)
+        let (lines, shown) = open(path)?;
+        Self::new(lines, shown, character)
+    }
+
+    /// As [`Self::open`], for a sender, which does not know the character at the other end.
+    pub fn open_for_any_character(path: &Path) -> Result<Self, FeedError> {
+        let (lines, shown) = open(path)?;
+        Self::begin(lines, shown, PublishReader::for_any_character())
     }
 }
 
 impl<R: BufRead> Feed<R> {
     /// Reads the hello from `lines`; `path` is what errors call the feed.
     pub fn new(lines: R, path: String, character: &Character) -> Result<Self, FeedError> {
+        Self::begin(lines, path, PublishReader::new(character))
+    }
+
+    /// As [`Self::new`], for a sender, which does not know the character at the other end.
+    pub fn new_for_any_character(lines: R, path: String) -> Result<Self, FeedError> {
+        Self::begin(lines, path, PublishReader::for_any_character())
+    }
+
+    fn begin(lines: R, path: String, reader: PublishReader) -> Result<Self, FeedError> {
         let mut hello = PublishHello { source: String::new(), fps: None, layout: None, image: None, focal: None, takeover: false };
-        let reader = PublishReader::new(character);
         let mut feed = Self { hello: hello.clone(), path, line: 0, text: String::new(), lines, reader };
         if feed.next_line()? {
             match feed.read(&mut TrackingFrame::default())? {
@@ -115,7 +128,9 @@ impl<R: BufRead> Feed<R> {
             let read = (&mut self.lines).take(most).read_line(&mut self.text);
             let num_bytes = match read {
                 Ok(num_bytes) => num_bytes,
-                Err(error) if error.kind() == ErrorKind::InvalidData => return Err(self.refuse(MessageError::new("malformed_json", "line is not UTF-8 text"))),
+                Err(error) if error.kind() == ErrorKind::InvalidData => {
+                    return Err(self.refuse(MessageError::new("malformed_json", "line is not UTF-8 text")));
+                }
                 Err(source) => return Err(FeedError::Io { path: self.path.clone(), source }),
             };
             if num_bytes == 0 {
@@ -130,6 +145,12 @@ impl<R: BufRead> Feed<R> {
             }
         }
     }
+}
+
+fn open(path: &Path) -> Result<(BufReader<File>, String), FeedError> {
+    let shown = path.display().to_string();
+    let file = File::open(path).map_err(|source| FeedError::Io { path: shown.clone(), source })?;
+    Ok((BufReader::with_capacity(1 << 16, file), shown))
 }
 
 const NO_HELLO: &str = "the first line must be {\"type\":\"hello\",\"version\":1,…}";

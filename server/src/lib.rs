@@ -1,4 +1,25 @@
 //! Takes what trackers see, moves a character's bones with it and streams the solved frames to viewers.
+//!
+//! `solve` and `pipeline` are pure: frames in, packets out. Everything else is the service around them: [`run`] serves,
+//! [`send()`] publishes feed files.
 
+#![forbid(unsafe_code)]
+
+mod clip;
+mod config;
 pub mod feed;
+mod http;
+mod metrics;
+pub mod pipeline;
+mod publish;
+mod room;
+mod send;
+mod service;
+mod socket;
 pub mod solve;
+mod viewer;
+
+pub use clip::{ClipError, clip_feed};
+pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts};
+pub use send::{SendError, SendOptions, SendReport, SendSource, send};
+pub use service::{ServerError, bind, load_character, run};

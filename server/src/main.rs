@@ -1,1 +1,239 @@
-fn main() {}
+//! The server's command line: `serve` and `send`.
+
+use anyhow::Context;
+use clap::{Args, Parser, Subcommand};
+use indicatif::{ProgressBar, ProgressStyle};
+use rhytid_server::{Access, Limits, SendOptions, SendSource, ServerConfig, Timeouts, bind, clip_feed, load_character, run, send};
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use tracing_subscriber::EnvFilter;
+
+/// Turns what a face tracker sees into a moving, wrinkled face and streams it to viewers.
+#[derive(Parser)]
+#[command(version, about)]
+struct Cli {
+    /// Say more: -v what happens, -vv every connection and bad message.
+    #[arg(short, long, action = clap::ArgAction::Count, global = true)]
+    verbose: u8,
+    /// Write the log as JSON, one object a line.
+    #[arg(long, global = true)]
+    log_json: bool,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Serve rooms until SIGINT or SIGTERM.
+    Serve(Box<ServeArgs>),
+    /// Publish a feed file, or an animation clip of a character.
+    Send(SendArgs),
+}
+
+#[derive(Args)]
+struct ServeArgs {
+    /// Address and port; port 0 takes a free one.
+    #[arg(long, default_value = "127.0.0.1:7878")]
+    listen: String,
+    /// The character's .glb instead of the built-in one.
+    #[arg(long, value_name = "FILE.glb")]
+    character: Option<PathBuf>,
+    /// Settings; flags given besides win.
+    #[arg(long, value_name = "FILE.toml")]
+    config: Option<PathBuf>,
+    #[command(flatten)]
+    limits: Limits,
+    #[command(flatten)]
+    timeouts: Timeouts,
+    #[command(flatten)]
+    access: Access,
+}
+
+#[derive(Args)]
+struct SendArgs {
+    /// The feed file.
+    #[arg(value_name = "FEED.jsonl", required_unless_present = "clip", conflicts_with = "clip")]
+    feed: Option<PathBuf>,
+    /// An animation clip of the character instead of a feed file.
+    #[arg(long, value_name = "NAME")]
+    clip: Option<String>,
+    /// The character that has the clip, instead of the built-in one.
+    #[arg(long, value_name = "FILE.glb", requires = "clip")]
+    character: Option<PathBuf>,
+    /// The server.
+    #[arg(long, default_value = "ws://127.0.0.1:7878", value_name = "URL")]
+    to: String,
+    /// The room.
+    #[arg(long, default_value = "demo")]
+    room: String,
+    /// Feed seconds a second, or `max`: as fast as the server takes it.
+    #[arg(long, default_value = "1.0", value_parser = parse_speed)]
+    speed: f64,
+    /// Send it again and again, each time as a new session.
+    #[arg(long = "loop")]
+    repeats: bool,
+    /// Take the room over from another publisher.
+    #[arg(long)]
+    takeover: bool,
+}
+
+fn parse_speed(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        _ if text == "max" => Ok(f64::INFINITY),
+        Ok(speed) if speed > 0.0 && speed.is_finite() => Ok(speed),
+        _ => Err("expected a number more than 0, or max".into()),
+    }
+}
+
+#[tokio::main]
+async fn main() -> ExitCode {
+    let matches = <Cli as clap::CommandFactory>::command().get_matches();
+    let cli = match <Cli as clap::FromArgMatches>::from_arg_matches(&matches) {
+        Ok(cli) => cli,
+        Err(error) => error.exit(),
+    };
+    start_log(&cli);
+    let result = match cli.command {
+        Command::Serve(args) => serve(*args, matches.subcommand_matches("serve")).await,
+        Command::Send(args) => send_feed(args).await,
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Logs go to standard error; `RUST_LOG` overrules `-v`.
+fn start_log(cli: &Cli) {
+    let level = match (cli.verbose, &cli.command) {
+        (0, Command::Send(_)) => "warn",
+        (0, Command::Serve(_)) | (1, _) => "rhytid_server=info,warn",
+        _ => "rhytid_server=debug,info",
+    };
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    if cli.log_json {
+        log.json().init();
+    } else {
+        log.init();
+    }
+}
+
+async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::Result<()> {
+    let mut config = match &args.config {
+        Some(path) => ServerConfig::from_file(path)?,
+        None => ServerConfig::default(),
+    };
+    let is_given = |id: &str| matches.is_some_and(|matches| matches.value_source(id) == Some(clap::parser::ValueSource::CommandLine));
+    macro_rules! take {
+        ($($id:literal: $($part:ident).+),* $(,)?) => { $(if is_given($id) { config.$($part).+ = args.$($part).+; })* };
+    }
+    take! {
+        "listen": listen,
+        "max-rooms": limits.rooms,
+        "max-viewers": limits.viewers_per_room,
+        "max-message": limits.message_bytes,
+        "max-fps": limits.frames_per_second,
+        "max-bad-frames": limits.bad_frames_in_a_row,
+        "max-connections": limits.connections_per_address,
+        "hello-timeout": timeouts.hello,
+        "ping-interval": timeouts.ping,
+        "publisher-timeout": timeouts.publisher_idle,
+        "viewer-timeout": timeouts.viewer_idle,
+        "write-timeout": timeouts.write,
+        "room-timeout": timeouts.room_idle,
+    }
+    config.character = args.character.or(config.character);
+    config.access.hosts.extend(args.access.hosts);
+    config.access.origins.extend(args.access.origins);
+    config.validate()?;
+    raise_file_limit();
+
+    let mut interrupt = Signals::new().context("cannot wait for signals")?;
+    // Before the port is bound: who sees the line below may connect, and a broken character must not leave a port behind.
+    load_character(config.character.as_deref())?;
+    let listener = bind(&config.listen).await?;
+    println!("listening on http://{}", listener.local_addr()?);
+    std::io::stdout().flush()?;
+    run(listener, config, async move { interrupt.wait().await }).await?;
+    Ok(())
+}
+
+/// Every viewer is a file descriptor, and the usual soft limit is 1,024.
+fn raise_file_limit() {
+    #[cfg(unix)]
+    {
+        use rustix::process::{Resource, getrlimit, setrlimit};
+        let mut limit = getrlimit(Resource::Nofile);
+        limit.current = limit.maximum;
+        if let Err(error) = setrlimit(Resource::Nofile, limit) {
+            tracing::warn!(%error, "cannot raise the limit of open files");
+        }
+    }
+}
+
+/// SIGINT and SIGTERM; Ctrl-C elsewhere.
+struct Signals {
+    #[cfg(unix)]
+    interrupt: tokio::signal::unix::Signal,
+    #[cfg(unix)]
+    terminate: tokio::signal::unix::Signal,
+}
+
+impl Signals {
+    #[cfg(unix)]
+    fn new() -> std::io::Result<Self> {
+        use tokio::signal::unix::{SignalKind, signal};
+        Ok(Self { interrupt: signal(SignalKind::interrupt())?, terminate: signal(SignalKind::terminate())? })
+    }
+
+    #[cfg(unix)]
+    async fn wait(&mut self) {
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
+        }
+    }
+
+    #[cfg(not(unix))]
+    fn new() -> std::io::Result<Self> {
+        Ok(Self {})
+    }
+
+    #[cfg(not(unix))]
+    async fn wait(&mut self) {
+        // Without a handler the system ends the process itself.
+        let _ = tokio::signal::ctrl_c().await;
+    }
+}
+
+async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
+    let source = match (args.feed, args.clip) {
+        (Some(path), _) => SendSource::File(path),
+        (None, clip) => {
+            let name = clip.context("expected a feed file or --clip")?;
+            let (character, glb) = load_character(args.character.as_deref())?;
+            SendSource::Text(clip_feed(&glb, &character, &name)?, format!("clip {name}"))
+        }
+    };
+    let progress = ProgressBar::new(0);
+    progress
+        .set_style(ProgressStyle::with_template("{elapsed_precise} [{bar:40}] {percent:>3}% {bytes}/{total_bytes}")?.progress_chars("=> "));
+    let options = SendOptions { source, to: args.to, room: args.room, speed: args.speed, repeats: args.repeats, takeover: args.takeover };
+    let mut interrupt = Signals::new().context("cannot wait for signals")?;
+    let report = tokio::select! {
+        report = send(&options, &progress) => report,
+        () = interrupt.wait() => {
+            progress.abandon();
+            return Ok(());
+        }
+    };
+    progress.finish_and_clear();
+    let report = report?;
+    eprintln!("sent {} frames, {} refused", report.frames, report.errors);
+    Ok(())
+}

@@ -109,7 +109,7 @@ impl Fields {
     }
 
     /// Reads `text`. Broken JSON and wrong types are errors here; broken rules stand in `problem`.
-    pub fn read(&mut self, text: &str, bones: &BTreeMap<String, usize>) -> Result<(), MessageError> {
+    pub fn read(&mut self, text: &str, bones: Option<&BTreeMap<String, usize>>) -> Result<(), MessageError> {
         self.clear();
         let mut deserializer = serde_json::Deserializer::from_str(text);
         let result = deserializer.deserialize_map(MessageVisitor { fields: self, bones });
@@ -138,7 +138,7 @@ impl Fields {
 
 struct MessageVisitor<'a> {
     fields: &'a mut Fields,
-    bones: &'a BTreeMap<String, usize>,
+    bones: Option<&'a BTreeMap<String, usize>>,
 }
 
 /// The fields that mean something, as one word each; anything else is skipped.
@@ -494,7 +494,7 @@ impl<'de> Visitor<'de> for Weights<'_> {
     }
 }
 
-struct Bones<'a>(&'a mut Fields, &'a BTreeMap<String, usize>);
+struct Bones<'a>(&'a mut Fields, Option<&'a BTreeMap<String, usize>>);
 
 impl<'de> DeserializeSeed<'de> for Bones<'_> {
     type Value = ();
@@ -504,7 +504,7 @@ impl<'de> DeserializeSeed<'de> for Bones<'_> {
 }
 
 /// A bone by name, or the name where the character has no such bone.
-struct BoneKey<'a>(&'a BTreeMap<String, usize>);
+struct BoneKey<'a>(Option<&'a BTreeMap<String, usize>>);
 
 impl<'de> DeserializeSeed<'de> for BoneKey<'_> {
     type Value = Result<usize, String>;
@@ -519,7 +519,7 @@ impl Visitor<'_> for BoneKey<'_> {
         f.write_str("the name of a bone")
     }
     fn visit_str<E: Error>(self, name: &str) -> Result<Self::Value, E> {
-        Ok(self.0.get(name).copied().ok_or_else(|| cut(name)))
+        Ok(self.0.and_then(|names| names.get(name)).copied().ok_or_else(|| cut(name)))
     }
 }
 
@@ -536,13 +536,14 @@ impl<'de> Visitor<'de> for Bones<'_> {
             let (point, count) = map.next_value_seed(Numbers::<3>("[x, y, z] in metres, head space"))?;
             let bone = match bone {
                 Ok(bone) => bone,
+                Err(_) if names.is_none() => continue,
                 Err(name) => {
                     fields.refuse("unknown_bone", || format!("field bones.{name} is no bone of this character; the view hello lists them"));
                     continue;
                 }
             };
             if count != 3 || !point.iter().all(|value| value.abs() <= MAX_POINT) {
-                let name = || names.iter().find(|(_, index)| **index == bone).map_or("", |(name, _)| name.as_str());
+                let name = || names.into_iter().flatten().find(|(_, index)| **index == bone).map_or("", |(name, _)| name.as_str());
                 fields.refuse("out_of_range", || {
                     format!(
                         "field bones.{} is {:?}, expected 3 numbers, metres in head space within ±{MAX_POINT}",

@@ -20,28 +20,39 @@ const MAX_FPS: f64 = 1000.0;
 /// Reads the text messages of one publish session, or the lines of a feed file, without building a tree of JSON.
 #[derive(Debug, Clone)]
 pub struct PublishReader {
-    bones: BTreeMap<String, usize>,
-    features: BTreeSet<String>,
+    /// `None` where the character is not known here.
+    names: Option<Names>,
     fields: Fields,
     hello: Option<PublishHello>,
     last_t: Option<f64>,
 }
 
+/// What a character calls its parts.
+#[derive(Debug, Clone)]
+struct Names {
+    bones: BTreeMap<String, usize>,
+    features: BTreeSet<String>,
+}
+
 impl PublishReader {
     /// A reader for a session that drives `character`, whose names `bones` and named layouts must use.
     pub fn new(character: &Character) -> Self {
-        Self {
+        let names = Names {
             bones: character.bones.iter().enumerate().map(|(i, bone)| (bone.name.clone(), i)).collect(),
             features: character.features.keys().cloned().collect(),
-            fields: Fields::new(),
-            hello: None,
-            last_t: None,
-        }
+        };
+        Self { names: Some(names), fields: Fields::new(), hello: None, last_t: None }
+    }
+
+    /// A reader for a sender, which does not know the character at the other end: names of bones and of feature points are
+    /// not checked, and the bones of a frame are left out.
+    pub fn for_any_character() -> Self {
+        Self { names: None, fields: Fields::new(), hello: None, last_t: None }
     }
 
     /// Reads one message. A frame is written into `frame`, whose buffers are reused; after an error `frame` is as it was.
     pub fn read(&mut self, text: &str, frame: &mut TrackingFrame) -> Result<PublishMessage, MessageError> {
-        self.fields.read(text, &self.bones)?;
+        self.fields.read(text, self.names.as_ref().map(|names| &names.bones))?;
         if let Some(problem) = self.fields.problem.take() {
             return Err(problem);
         }
@@ -76,7 +87,8 @@ impl PublishReader {
                 Err(MessageError::new("out_of_range", format!("field {field} is {value}, expected {unit}, more than 0 and at most {most}")))
             }
         };
-        let layout = fields.layout.take().map(|layout| check_layout(layout, &self.features)).transpose()?;
+        let layout =
+            fields.layout.take().map(|layout| check_layout(layout, self.names.as_ref().map(|names| &names.features))).transpose()?;
         let image = match fields.image {
             Some([width, height]) => {
                 Some([within("image[0]", width, MAX_IMAGE, "pixels")?, within("image[1]", height, MAX_IMAGE, "pixels")?])
@@ -148,7 +160,7 @@ fn missing(field: &str, expected: &str) -> MessageError {
     MessageError::new("missing_field", format!("field {field} is missing, expected {expected}"))
 }
 
-fn check_layout(layout: LayoutField, features: &BTreeSet<String>) -> Result<Layout, MessageError> {
+fn check_layout(layout: LayoutField, features: Option<&BTreeSet<String>>) -> Result<Layout, MessageError> {
     let names = match layout {
         LayoutField::Name(name) => {
             return match name.as_str() {
@@ -175,7 +187,7 @@ fn check_layout(layout: LayoutField, features: &BTreeSet<String>) -> Result<Layo
     let mut seen = BTreeSet::new();
     for (i, name) in names.iter().enumerate() {
         let shown: String = name.chars().take(40).collect();
-        if !features.contains(name) {
+        if features.is_some_and(|features| !features.contains(name)) {
             return Err(MessageError::new(
                 "unknown_layout",
                 format!("field layout[{i}] is {shown:?}, which is no feature point of this character"),

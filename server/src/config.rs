@@ -1,0 +1,234 @@
+//! What a user may set: the listening address, the character, every limit and every time-out.
+
+use crate::solve::SolveConfig;
+use rhytid_shared::limits::MAX_MESSAGE_BYTES;
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Why a configuration was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerConfigError {
+    /// The file could not be read.
+    #[error("cannot read config {path}: {source}")]
+    Io {
+        /// The file as it was named.
+        path: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file is no TOML, or has a field that is none.
+    #[error("config {path}: {source}")]
+    Toml {
+        /// The file as it was named.
+        path: String,
+        /// What is wrong with it, with its line.
+        source: toml::de::Error,
+    },
+    /// A value outside its range.
+    #[error("config field {field} is {got}, expected {expected}")]
+    Range {
+        /// Path of the field.
+        field: &'static str,
+        /// Its value.
+        got: String,
+        /// The range.
+        expected: &'static str,
+    },
+    /// A setting of the solve makes no sense.
+    #[error(transparent)]
+    Solve(#[from] crate::solve::ConfigError),
+}
+
+/// Everything the service can be told.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ServerConfig {
+    /// Address and port; port 0 takes a free one. Loopback unless the user says otherwise.
+    pub listen: String,
+    /// The character's `.glb`; the built-in one where there is none.
+    pub character: Option<PathBuf>,
+    /// How much of everything.
+    pub limits: Limits,
+    /// How long for everything.
+    pub timeouts: Timeouts,
+    /// Who may come from a browser.
+    pub access: Access,
+    /// The solve.
+    pub solve: SolveConfig,
+}
+
+impl Default for ServerConfig {
+    fn default() -> Self {
+        Self {
+            listen: "127.0.0.1:7878".into(),
+            character: None,
+            limits: Limits::default(),
+            timeouts: Timeouts::default(),
+            access: Access::default(),
+            solve: SolveConfig::default(),
+        }
+    }
+}
+
+/// How much of everything the service takes.
+#[derive(Debug, Clone, PartialEq, Deserialize, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+pub struct Limits {
+    /// Rooms at a time.
+    #[arg(id = "max-rooms", long = "max-rooms", default_value_t = Self::default().rooms, value_name = "N")]
+    pub rooms: usize,
+    /// Viewers in one room.
+    #[arg(id = "max-viewers", long = "max-viewers", default_value_t = Self::default().viewers_per_room, value_name = "N")]
+    pub viewers_per_room: usize,
+    /// Bytes in one message of a publisher.
+    #[arg(id = "max-message", long = "max-message", default_value_t = Self::default().message_bytes, value_name = "BYTES")]
+    pub message_bytes: usize,
+    /// Frames a second from one publisher; a faster one is slowed down.
+    #[arg(id = "max-fps", long = "max-fps", default_value_t = Self::default().frames_per_second, value_name = "N")]
+    pub frames_per_second: u32,
+    /// Bad frames in a row that end a publisher's session.
+    #[arg(id = "max-bad-frames", long = "max-bad-frames", default_value_t = Self::default().bad_frames_in_a_row, value_name = "N")]
+    pub bad_frames_in_a_row: u32,
+    /// Connections from one address; does not hold for loopback.
+    #[arg(id = "max-connections", long = "max-connections", default_value_t = Self::default().connections_per_address, value_name = "N")]
+    pub connections_per_address: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            rooms: 1024,
+            viewers_per_room: 4096,
+            message_bytes: MAX_MESSAGE_BYTES,
+            // Five percent of a core, and 16 times a fast face camera.
+            frames_per_second: 1000,
+            bad_frames_in_a_row: 100,
+            // A class behind one router.
+            connections_per_address: 256,
+        }
+    }
+}
+
+/// How long the service waits, seconds.
+#[derive(Debug, Clone, PartialEq, Deserialize, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+pub struct Timeouts {
+    /// For a request's head, and for a publisher's hello.
+    #[arg(id = "hello-timeout", long = "hello-timeout", default_value_t = Self::default().hello, value_name = "SECONDS")]
+    pub hello: f64,
+    /// Between pings on a silent socket.
+    #[arg(id = "ping-interval", long = "ping-interval", default_value_t = Self::default().ping, value_name = "SECONDS")]
+    pub ping: f64,
+    /// Without a sign of life from a publisher (frames or pongs).
+    #[arg(id = "publisher-timeout", long = "publisher-timeout", default_value_t = Self::default().publisher_idle, value_name = "SECONDS")]
+    pub publisher_idle: f64,
+    /// Without a pong from a viewer; a laptop that slept for a minute is still there afterwards.
+    #[arg(id = "viewer-timeout", long = "viewer-timeout", default_value_t = Self::default().viewer_idle, value_name = "SECONDS")]
+    pub viewer_idle: f64,
+    /// For one write to get into the socket.
+    #[arg(id = "write-timeout", long = "write-timeout", default_value_t = Self::default().write, value_name = "SECONDS")]
+    pub write: f64,
+    /// That a room stays without publisher and viewers.
+    #[arg(id = "room-timeout", long = "room-timeout", default_value_t = Self::default().room_idle, value_name = "SECONDS")]
+    pub room_idle: f64,
+}
+
+impl Default for Timeouts {
+    fn default() -> Self {
+        Self { hello: 10.0, ping: 5.0, publisher_idle: 15.0, viewer_idle: 90.0, write: 75.0, room_idle: 60.0 }
+    }
+}
+
+/// Who may come from a browser. Programs that send no `Origin` are not asked.
+#[derive(Debug, Clone, PartialEq, Default, Deserialize, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+pub struct Access {
+    /// Host names under which this server may be asked for, besides loopback's (repeat for several).
+    #[arg(long = "allow-host", value_name = "HOST")]
+    pub hosts: Vec<String>,
+    /// Origins of other sites whose pages may use it, e.g. `https://example.org` (repeat for several).
+    #[arg(long = "allow-origin", value_name = "ORIGIN")]
+    pub origins: Vec<String>,
+}
+
+impl ServerConfig {
+    /// Reads a TOML file; fields it does not name keep their defaults.
+    pub fn from_file(path: &Path) -> Result<Self, ServerConfigError> {
+        let shown = path.display().to_string();
+        let text = std::fs::read_to_string(path).map_err(|source| ServerConfigError::Io { path: shown.clone(), source })?;
+        toml::from_str(&text).map_err(|source| ServerConfigError::Toml { path: shown, source })
+    }
+
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ServerConfigError> {
+        let limits = &self.limits;
+        for (field, got, most) in [
+            ("limits.rooms", limits.rooms, 1_000_000),
+            ("limits.viewers_per_room", limits.viewers_per_room, 1_000_000),
+            ("limits.frames_per_second", limits.frames_per_second as usize, 1_000_000),
+            ("limits.bad_frames_in_a_row", limits.bad_frames_in_a_row as usize, 1_000_000),
+            ("limits.connections_per_address", limits.connections_per_address, 1_000_000),
+        ] {
+            if got == 0 || got > most {
+                return Err(ServerConfigError::Range { field, got: got.to_string(), expected: "1 to 1000000" });
+            }
+        }
+        if !(1024..=16 << 20).contains(&limits.message_bytes) {
+            return Err(ServerConfigError::Range {
+                field: "limits.message_bytes",
+                got: limits.message_bytes.to_string(),
+                expected: "1024 to 16777216",
+            });
+        }
+        let timeouts = &self.timeouts;
+        for (field, got) in [
+            ("timeouts.hello", timeouts.hello),
+            ("timeouts.ping", timeouts.ping),
+            ("timeouts.publisher_idle", timeouts.publisher_idle),
+            ("timeouts.viewer_idle", timeouts.viewer_idle),
+            ("timeouts.write", timeouts.write),
+            ("timeouts.room_idle", timeouts.room_idle),
+        ] {
+            if !(0.01..=86_400.0).contains(&got) {
+                return Err(ServerConfigError::Range { field, got: got.to_string(), expected: "0.01 to 86400 seconds" });
+            }
+        }
+        Ok(self.solve.validate()?)
+    }
+}
+
+/// A time-out from the configuration, where it has been checked.
+pub(crate) fn seconds(value: f64) -> Duration {
+    Duration::from_secs_f64(value)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_names_only_what_it_changes() {
+        let config: ServerConfig =
+            toml::from_str("listen = \"0.0.0.0:80\"\n[limits]\nrooms = 3\n[timeouts]\nhello = 0.5\n[access]\nhosts = [\"a.example\"]")
+                .unwrap();
+        assert_eq!((config.limits.rooms, config.limits.viewers_per_room, config.timeouts.hello), (3, 4096, 0.5));
+        assert_eq!((config.listen.as_str(), config.access.hosts.len()), ("0.0.0.0:80", 1));
+        config.validate().unwrap();
+    }
+
+    #[test]
+    fn wrong_settings_are_named() {
+        let says = |text: &str| match toml::from_str::<ServerConfig>(text) {
+            Ok(config) => config.validate().unwrap_err().to_string(),
+            Err(error) => error.to_string(),
+        };
+        assert!(says("[limits]\nroms = 3").contains("unknown field `roms`"), "{}", says("[limits]\nroms = 3"));
+        assert!(says("[limits]\nrooms = 0").contains("limits.rooms is 0, expected 1 to"));
+        assert!(says("[limits]\nmessage_bytes = 3").contains("limits.message_bytes is 3"));
+        assert!(says("[timeouts]\nping = -1.0").contains("timeouts.ping is -1"));
+        assert!(says("[timeouts]\nping = nan").contains("timeouts.ping is NaN"));
+        let missing = ServerConfig::from_file(Path::new("no/such.toml")).unwrap_err().to_string();
+        assert!(missing.contains("no/such.toml"), "{missing}");
+    }
+}

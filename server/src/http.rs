@@ -1,0 +1,148 @@
+//! What is asked for over HTTP: pages, listings, the character, and the two kinds of WebSocket.
+
+use crate::service::{Hub, Peer};
+use crate::socket::{Ending, ErrorMessage, close, upgrade};
+use crate::{publish, viewer};
+use axum::Router;
+use axum::body::Bytes;
+use axum::extract::{Path, Request, State};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::get;
+use rhytid_shared::RoomName;
+use std::sync::Arc;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+
+/// All routes.
+pub(crate) fn router(hub: Arc<Hub>) -> Router {
+    Router::new()
+        .route("/", get(page))
+        .route("/healthz", get(async || "ok\n"))
+        .route("/metrics", get(metrics))
+        .route("/api/rooms", get(rooms))
+        .route("/characters/{file}", get(character))
+        .route("/v1/rooms/{room}/publish", get(publish_socket))
+        .route("/v1/rooms/{room}/view", get(view_socket))
+        .fallback(async || ErrorMessage::new("not_found", "there is nothing at this address").response(StatusCode::NOT_FOUND))
+        .layer(from_fn_with_state(hub.clone(), check_browser))
+        .with_state(hub)
+}
+
+/// Browsers carry other sites' pages: a request with an `Origin` must come from this server's own page or an allowed site, and
+/// a server on loopback must be asked for by a name of loopback's, or a page elsewhere could reach it by a name that points here.
+async fn check_browser(State(hub): State<Arc<Hub>>, request: Request, next: Next) -> Response {
+    match check_names(request.headers(), &hub) {
+        Ok(()) => next.run(request).await,
+        Err(error) => {
+            hub.metrics.end(error.code);
+            tracing::warn!(code = error.code, message = error.message, "browser request refused");
+            error.response(StatusCode::FORBIDDEN)
+        }
+    }
+}
+
+fn check_names(headers: &HeaderMap, hub: &Hub) -> Result<(), ErrorMessage> {
+    let access = &hub.config.access;
+    let shown = |text: &str| text.chars().take(80).collect::<String>();
+    let host = headers.get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
+    let name = host_name(host);
+    let is_listed = access.hosts.iter().any(|allowed| allowed.eq_ignore_ascii_case(name));
+    let asks_for_loopback =
+        name.eq_ignore_ascii_case("localhost") || name.trim_matches(['[', ']']).parse().is_ok_and(|ip: std::net::IpAddr| ip.is_loopback());
+    // Elsewhere than on loopback any name will do, unless the user listed some.
+    let is_free = !hub.listens_on_loopback && access.hosts.is_empty();
+    if !(is_listed || asks_for_loopback || is_free) {
+        let message =
+            format!("header Host is {:?}, expected a name of this server (localhost, or one given with --allow-host)", shown(host));
+        return Err(ErrorMessage::new("forbidden_host", message));
+    }
+    let Some(origin) = headers.get(header::ORIGIN) else { return Ok(()) };
+    let origin = origin.to_str().unwrap_or_default();
+    let is_own = origin.split_once("://").is_some_and(|(_, origin_host)| origin_host.eq_ignore_ascii_case(host));
+    if is_own || access.origins.iter().any(|allowed| allowed.eq_ignore_ascii_case(origin)) {
+        return Ok(());
+    }
+    let message = format!(
+        "header Origin is {:?}, expected this server's own page (Host {:?}) or one given with --allow-origin",
+        shown(origin),
+        shown(host)
+    );
+    Err(ErrorMessage::new("forbidden_origin", message))
+}
+
+/// `host` without its port.
+fn host_name(host: &str) -> &str {
+    match host.rsplit_once(':') {
+        // An IPv6 address without a port ends with its bracket.
+        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
+        _ => host,
+    }
+}
+
+async fn page() -> Html<&'static str> {
+    Html(include_str!("page.html"))
+}
+
+async fn metrics(State(hub): State<Arc<Hub>>) -> Response {
+    ([(header::CONTENT_TYPE, "application/openmetrics-text; version=1.0.0; charset=utf-8")], hub.metrics.text()).into_response()
+}
+
+async fn rooms(State(hub): State<Arc<Hub>>) -> Response {
+    axum::Json(serde_json::json!({ "rooms": hub.rooms.list() })).into_response()
+}
+
+async fn character(State(hub): State<Arc<Hub>>, Path(file): Path<String>, headers: HeaderMap) -> Response {
+    if hub.character_url.strip_prefix("/characters/") != Some(file.as_str()) {
+        let message = format!("this server's character is at {}", hub.character_url);
+        return ErrorMessage::new("not_found", message).response(StatusCode::NOT_FOUND);
+    }
+    let tag = format!("\"{}\"", hub.character.sha256);
+    let known = headers.get(header::IF_NONE_MATCH).is_some_and(|given| given.as_bytes() == tag.as_bytes());
+    let describe = [(header::ETAG, tag), (header::CACHE_CONTROL, "no-cache".into()), (header::CONTENT_TYPE, "model/gltf-binary".into())];
+    if known {
+        return (StatusCode::NOT_MODIFIED, describe).into_response();
+    }
+    (describe, Bytes::clone(&hub.glb)).into_response()
+}
+
+fn room_name(text: &str) -> Result<RoomName, ErrorMessage> {
+    RoomName::new(text).map_err(|error| ErrorMessage::new("bad_room_name", error.to_string()))
+}
+
+async fn publish_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
+    let room = match room_name(&room) {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    tracing::debug!(%room, peer = ?request.extensions().get::<Peer>(), "publisher connects");
+    let config = publish::socket_config(&hub);
+    upgrade(request, config, Vec::new(), move |socket| publish::talk(hub, socket, room))
+}
+
+async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
+    let room = match room_name(&room) {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    let query = request.uri().query().unwrap_or_default();
+    let format = query.split('&').find_map(|pair| pair.strip_prefix("format=")).unwrap_or("binary");
+    if !matches!(format, "json" | "binary") {
+        let message = format!("query field format is {:?}, expected json or binary", format.chars().take(40).collect::<String>());
+        return ErrorMessage::new("unknown_format", message).response(StatusCode::BAD_REQUEST);
+    }
+    let wants_json = format == "json";
+    tracing::debug!(%room, wants_json, peer = ?request.extensions().get::<Peer>(), "viewer connects");
+    match hub.rooms.join(&room) {
+        Ok(viewing) => {
+            let first = viewer::first_frames(&hub, &room);
+            upgrade(request, viewer::socket_config(), first, move |socket| viewer::talk(hub, socket, viewing, wants_json))
+        }
+        // A browser's page cannot read the answer to a handshake, so the refusal is a message.
+        Err(error) => {
+            let ending = Ending::error(CloseCode::Again, ErrorMessage::new(error.code(), error.to_string()));
+            hub.metrics.end(error.code());
+            upgrade(request, viewer::socket_config(), Vec::new(), async move |socket| close(socket, &ending).await)
+        }
+    }
+}

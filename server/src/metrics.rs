@@ -1,0 +1,78 @@
+//! What the service counts, as Prometheus reads it.
+
+use prometheus_client::encoding::EncodeLabelSet;
+use prometheus_client::encoding::text::encode;
+use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
+use prometheus_client::registry::{Registry, Unit};
+
+/// Label of a count by reason.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct Reason {
+    reason: &'static str,
+}
+
+/// Every counter of the service.
+pub(crate) struct Metrics {
+    registry: Registry,
+    pub rooms: Gauge,
+    pub publishers: Gauge,
+    pub viewers: Gauge,
+    pub frames_in: Counter,
+    pub frames_out: Counter,
+    pub bytes_in: Counter,
+    pub bytes_out: Counter,
+    pub solve_seconds: Histogram,
+    dropped: Family<Reason, Counter>,
+    refused: Family<Reason, Counter>,
+}
+
+impl Metrics {
+    pub fn new() -> Self {
+        let mut registry = Registry::with_prefix("rhytid");
+        let metrics = Self {
+            rooms: Gauge::default(),
+            publishers: Gauge::default(),
+            viewers: Gauge::default(),
+            frames_in: Counter::default(),
+            frames_out: Counter::default(),
+            bytes_in: Counter::default(),
+            bytes_out: Counter::default(),
+            // 2 µs to 4 ms.
+            solve_seconds: Histogram::new(exponential_buckets(2e-6, 2.0, 12)),
+            dropped: Family::default(),
+            refused: Family::default(),
+            registry: Registry::default(),
+        };
+        registry.register("rooms", "Rooms that exist", metrics.rooms.clone());
+        registry.register("publishers", "Publishers connected", metrics.publishers.clone());
+        registry.register("viewers", "Viewers connected", metrics.viewers.clone());
+        registry.register("frames_in", "Frames accepted from publishers", metrics.frames_in.clone());
+        registry.register("frames_out", "Frames sent to viewers", metrics.frames_out.clone());
+        registry.register_with_unit("in", "Payload received from publishers", Unit::Bytes, metrics.bytes_in.clone());
+        registry.register_with_unit("out", "Payload sent to viewers", Unit::Bytes, metrics.bytes_out.clone());
+        registry.register_with_unit("solve", "Time to solve one frame", Unit::Seconds, metrics.solve_seconds.clone());
+        registry.register("frames_dropped", "Frames that were refused, or that a slow viewer skipped, by reason", metrics.dropped.clone());
+        registry.register("sessions_ended", "Sockets refused or ended by the server, by reason", metrics.refused.clone());
+        Self { registry, ..metrics }
+    }
+
+    /// Counts frames that did not go on.
+    pub fn drop_frames(&self, reason: &'static str, count: u64) {
+        self.dropped.get_or_create(&Reason { reason }).inc_by(count);
+    }
+
+    /// Counts a socket that the server refused or ended.
+    pub fn end(&self, reason: &'static str) {
+        self.refused.get_or_create(&Reason { reason }).inc();
+    }
+
+    /// The text that a Prometheus server scrapes.
+    pub fn text(&self) -> String {
+        let mut text = String::new();
+        encode(&mut text, &self.registry).expect("writing to a String cannot fail");
+        text
+    }
+}

@@ -1,0 +1,67 @@
+//! One publish session's way from tracking frames to packets: the solve, then the encoder. No clock, no I/O: the packets
+//! depend on the feed alone, so the same feed gives the same bytes at any speed.
+
+use crate::solve::{CalibrationReport, SolveConfig, SolveError, Solver};
+use rhytid_shared::packet::{Encoder, PacketKind};
+use rhytid_shared::{Character, FaceFrame, PublishHello, TrackingFrame};
+use std::sync::Arc;
+
+/// Solves and encodes the frames of one session.
+pub struct Pipeline {
+    solver: Solver,
+    encoder: Encoder,
+    face: FaceFrame,
+    session: u32,
+    num_frames: u32,
+}
+
+impl Pipeline {
+    /// Starts session number `session` (from 1) of a room.
+    pub fn new(character: Arc<Character>, config: &SolveConfig, hello: &PublishHello, session: u32) -> Result<Self, SolveError> {
+        Ok(Self {
+            encoder: Encoder::new(&*character),
+            face: FaceFrame::at_rest(&character),
+            solver: Solver::new(character, config, hello)?,
+            session,
+            num_frames: 0,
+        })
+    }
+
+    /// Solves `frame` and writes its packet into `packet`, which is emptied first. Every frame that the solve takes gives one
+    /// packet.
+    pub fn frame(&mut self, frame: &TrackingFrame, packet: &mut Vec<u8>) -> Result<PacketKind, SolveError> {
+        self.solve(frame)?;
+        Ok(self.encode(packet))
+    }
+
+    /// The first half of [`Self::frame`].
+    pub(crate) fn solve(&mut self, frame: &TrackingFrame) -> Result<(), SolveError> {
+        self.solver.solve(frame, &mut self.face)?;
+        self.face.session = self.session;
+        self.face.seq = self.num_frames;
+        // Checked by the reader: seconds from 0 to 1e10.
+        self.face.captured_at_micros = (frame.t * 1e6).round() as u64;
+        self.num_frames = self.num_frames.wrapping_add(1);
+        Ok(())
+    }
+
+    /// The second half of [`Self::frame`].
+    pub(crate) fn encode(&mut self, packet: &mut Vec<u8>) -> PacketKind {
+        self.encoder.encode(&self.face, packet)
+    }
+
+    /// Takes the neutral face now.
+    pub fn calibrate(&mut self) {
+        self.solver.calibrate();
+    }
+
+    /// A neutral that has been reached since the last call.
+    pub fn take_calibrated(&mut self) -> Option<CalibrationReport> {
+        self.solver.take_calibrated()
+    }
+
+    /// The frame last solved.
+    pub fn face(&self) -> &FaceFrame {
+        &self.face
+    }
+}

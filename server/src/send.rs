@@ -1,0 +1,246 @@
+//! `send`: publishes a feed in real time or as fast as the server takes it.
+
+use crate::feed::{Feed, FeedError, FeedItem};
+use futures_util::stream::SplitStream;
+use futures_util::{SinkExt, StreamExt};
+use indicatif::ProgressBar;
+use rhytid_shared::TrackingFrame;
+use serde::Deserialize;
+use std::io::{BufRead, BufReader, Cursor};
+use std::path::PathBuf;
+use std::time::Duration;
+use tokio::net::TcpStream;
+use tokio::sync::oneshot;
+use tokio::time::Instant;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+use tokio_tungstenite::tungstenite::{self, Message};
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
+
+/// How long the server may take to say that it is ready.
+const READY_TIMEOUT: Duration = Duration::from_secs(15);
+/// How long the server may take to read what is on its way and to close.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(120);
+
+/// Why a feed could not be sent.
+#[derive(Debug, thiserror::Error)]
+pub enum SendError {
+    /// The feed is broken.
+    #[error(transparent)]
+    Feed(#[from] FeedError),
+    /// The server could not be reached, or refused the connection.
+    #[error("cannot connect to {url}: {problem}")]
+    Connect {
+        /// Where to.
+        url: String,
+        /// What happened.
+        problem: String,
+    },
+    /// The server ended the session.
+    #[error("the server ended the session: {reason}")]
+    Ended {
+        /// In the server's words.
+        reason: String,
+    },
+}
+
+/// What to send.
+#[derive(Debug, Clone)]
+pub enum SendSource {
+    /// A feed file.
+    File(PathBuf),
+    /// A feed's text, and what to call it.
+    Text(String, String),
+}
+
+/// What to send, where to and how.
+#[derive(Debug, Clone)]
+pub struct SendOptions {
+    /// The feed.
+    pub source: SendSource,
+    /// The server, e.g. `ws://127.0.0.1:7878`.
+    pub to: String,
+    /// The room.
+    pub room: String,
+    /// Feed seconds a second; infinite for as fast as the server takes it.
+    pub speed: f64,
+    /// Send it again and again, each time as a new session.
+    pub repeats: bool,
+    /// Take the room over from another publisher.
+    pub takeover: bool,
+}
+
+/// What was sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SendReport {
+    /// Frames sent.
+    pub frames: u64,
+    /// Frames and other messages that the server refused.
+    pub errors: u64,
+}
+
+/// Sends a feed; `progress` counts its bytes and shows what the server answers.
+pub async fn send(options: &SendOptions, progress: &ProgressBar) -> Result<SendReport, SendError> {
+    let mut report = SendReport::default();
+    loop {
+        progress.set_position(0);
+        match &options.source {
+            SendSource::File(path) => {
+                if let Ok(file) = std::fs::metadata(path) {
+                    progress.set_length(file.len());
+                }
+                let feed: Feed<BufReader<std::fs::File>> = Feed::open_for_any_character(path)?;
+                send_once(feed, options, progress, &mut report).await?;
+            }
+            SendSource::Text(text, name) => {
+                progress.set_length(text.len() as u64);
+                let feed = Feed::new_for_any_character(Cursor::new(text.as_bytes()), name.clone())?;
+                send_once(feed, options, progress, &mut report).await?;
+            }
+        }
+        if !options.repeats {
+            return Ok(report);
+        }
+    }
+}
+
+/// What a server says to a publisher.
+#[derive(Debug, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+enum Answer {
+    Ready {
+        session: u32,
+    },
+    Calibrated {
+        t: f64,
+    },
+    Error {
+        code: String,
+        message: String,
+    },
+    #[serde(other)]
+    Unknown,
+}
+
+type Answers = SplitStream<WebSocketStream<MaybeTlsStream<TcpStream>>>;
+
+async fn send_once<R: BufRead>(
+    mut feed: Feed<R>,
+    options: &SendOptions,
+    progress: &ProgressBar,
+    report: &mut SendReport,
+) -> Result<(), SendError> {
+    let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
+    let (socket, _) = connect_async(&url).await.map_err(|error| SendError::Connect { url, problem: explain(error) })?;
+    let (mut sink, answers) = socket.split();
+    let (ready, mut is_ready) = oneshot::channel();
+    // Answers are read beside the sending: a server whose answers nobody reads stops reading, too.
+    let mut listening = tokio::spawn(listen(answers, progress.clone(), ready));
+    let ended = |end: Result<End, tokio::task::JoinError>| SendError::Ended {
+        reason: end.map_or_else(|error| error.to_string(), |end| end.reason),
+    };
+
+    if sink.send(Message::text(hello(feed.text(), options.takeover))).await.is_err() {
+        return Err(ended(listening.await));
+    }
+    tokio::select! {
+        // An end of the listening says more than that it will not be ready.
+        biased;
+        end = &mut listening => return Err(ended(end)),
+        ready = tokio::time::timeout(READY_TIMEOUT, &mut is_ready) => if ready.is_err() {
+            return Err(SendError::Ended { reason: format!("no answer to the hello within {} s", READY_TIMEOUT.as_secs()) });
+        },
+    }
+
+    let mut frame = TrackingFrame::default();
+    let mut clock: Option<(Instant, f64)> = None;
+    while let Some(item) = feed.next_frame(&mut frame)? {
+        if item == FeedItem::Frame {
+            let (start, t0) = *clock.get_or_insert_with(|| (Instant::now(), frame.t));
+            // At infinite speed every frame is due at once.
+            let due = start + Duration::from_secs_f64(((frame.t - t0) / options.speed).clamp(0.0, 1e9));
+            if due > Instant::now() {
+                tokio::select! {
+                    end = &mut listening => return Err(ended(end)),
+                    () = tokio::time::sleep_until(due) => {}
+                }
+            }
+            report.frames += 1;
+        }
+        if sink.send(Message::text(feed.text())).await.is_err() {
+            return Err(ended(listening.await));
+        }
+        progress.inc(feed.text().len() as u64 + 1);
+    }
+    // A server that has ended the session in this moment says so in its own close.
+    let _ = sink.send(Message::Close(None)).await;
+    match tokio::time::timeout(CLOSE_TIMEOUT, listening).await {
+        Ok(Ok(End { is_normal: true, errors, .. })) => {
+            report.errors += errors;
+            Ok(())
+        }
+        Ok(end) => Err(ended(end)),
+        Err(_) => Err(SendError::Ended { reason: "it does not answer the close".into() }),
+    }
+}
+
+/// How a session came to its end.
+struct End {
+    is_normal: bool,
+    reason: String,
+    errors: u64,
+}
+
+/// Shows the server's answers until it closes.
+async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sender<()>) -> End {
+    let mut ready = Some(ready);
+    let mut errors = 0;
+    let mut last_error = None;
+    while let Some(message) = answers.next().await {
+        match message {
+            Ok(Message::Text(text)) => match serde_json::from_str(&text) {
+                Ok(Answer::Ready { session }) => {
+                    tracing::info!(session, "ready");
+                    // The sender may have given up in this moment.
+                    let _ = ready.take().map(|ready| ready.send(()));
+                }
+                Ok(Answer::Calibrated { t }) => tracing::info!(t, "calibrated"),
+                Ok(Answer::Error { code, message }) => {
+                    errors += 1;
+                    progress.suspend(|| eprintln!("server: {message} ({code})"));
+                    last_error = Some(message);
+                }
+                Ok(Answer::Unknown) | Err(_) => tracing::debug!(%text, "unknown answer"),
+            },
+            Ok(Message::Close(frame)) => {
+                let is_normal = frame.as_ref().is_none_or(|frame| matches!(frame.code, CloseCode::Normal | CloseCode::Status));
+                let said = frame.map(|frame| frame.reason.to_string()).filter(|reason| !reason.is_empty());
+                let reason = last_error.or(said).unwrap_or_else(|| "without a reason".into());
+                return End { is_normal, reason, errors };
+            }
+            Ok(_) => {}
+            Err(error) => return End { is_normal: false, reason: last_error.unwrap_or_else(|| error.to_string()), errors },
+        }
+    }
+    End { is_normal: false, reason: last_error.unwrap_or_else(|| "the connection broke off".into()), errors }
+}
+
+/// The feed's hello, with `takeover` where it is wanted.
+fn hello(line: &str, takeover: bool) -> String {
+    match serde_json::from_str::<serde_json::Map<String, serde_json::Value>>(line) {
+        Ok(mut fields) if takeover => {
+            fields.insert("takeover".into(), true.into());
+            serde_json::Value::from(fields).to_string()
+        }
+        _ => line.to_owned(),
+    }
+}
+
+/// A failed handshake in the server's own words, where it has some.
+fn explain(error: tungstenite::Error) -> String {
+    if let tungstenite::Error::Http(response) = &error
+        && let Some(Answer::Error { message, .. }) = response.body().as_ref().and_then(|body| serde_json::from_slice(body).ok())
+    {
+        return message;
+    }
+    error.to_string()
+}

@@ -1,0 +1,207 @@
+//! WebSockets below the messages: the upgrade with its checks, small buffers, and closing so that the last word arrives.
+
+use crate::service::Place;
+use axum::body::Body;
+use axum::extract::Request;
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use futures_util::{SinkExt, StreamExt};
+use hyper_util::rt::TokioIo;
+use rhytid_shared::view::SUBPROTOCOL;
+use serde::Serialize;
+use std::future::Future;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::TcpStream;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+use tokio_tungstenite::tungstenite::protocol::{CloseFrame, Role, WebSocketConfig};
+use tokio_tungstenite::tungstenite::{Error, Message};
+
+/// A server's end of a WebSocket.
+pub(crate) type Socket = WebSocketStream<TcpStream>;
+
+/// How long a peer may take to answer a close before its connection is cut.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// How long the first frames, a few KB, may take to get into a fresh socket.
+const FIRST_WRITE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// An error as it goes to a peer, over HTTP or a socket.
+#[derive(Debug, Clone, Serialize)]
+#[serde(tag = "type", rename = "error")]
+pub(crate) struct ErrorMessage {
+    pub code: &'static str,
+    pub message: String,
+}
+
+impl ErrorMessage {
+    pub fn new(code: &'static str, message: impl Into<String>) -> Self {
+        Self { code, message: message.into() }
+    }
+
+    /// As an HTTP answer.
+    pub fn response(&self, status: StatusCode) -> Response {
+        (status, axum::Json(self)).into_response()
+    }
+}
+
+/// Why the server ends a socket: told as a message where there is an error, and in the close frame.
+#[derive(Debug, Clone)]
+pub(crate) struct Ending {
+    pub error: Option<ErrorMessage>,
+    pub code: CloseCode,
+    pub reason: String,
+}
+
+impl Ending {
+    /// Ends with an error message and the same words as the reason of the close.
+    pub fn error(code: CloseCode, error: ErrorMessage) -> Self {
+        Self { code, reason: error.message.clone(), error: Some(error) }
+    }
+
+    /// The server stops.
+    pub fn shutdown() -> Self {
+        Self { error: None, code: CloseCode::Away, reason: "server is shutting down".into() }
+    }
+}
+
+/// Why talking to a peer stopped.
+pub(crate) enum Stop {
+    /// The server ends it.
+    End(Ending),
+    /// The peer closed, vanished or does not take what it is sent.
+    Gone(&'static str),
+}
+
+impl From<Ending> for Stop {
+    fn from(ending: Ending) -> Self {
+        Self::End(ending)
+    }
+}
+
+/// Checks a request for a WebSocket, answers it and runs `talk` on the socket in a task of its own.
+pub(crate) fn upgrade<F, Fut>(mut request: Request, config: WebSocketConfig, first: Vec<u8>, talk: F) -> Response
+where
+    F: FnOnce(Socket) -> Fut + Send + 'static,
+    Fut: Future<Output = ()> + Send,
+{
+    let headers = request.headers();
+    let has_token = |name, token: &str| tokens(headers, &name).any(|given| given.eq_ignore_ascii_case(token));
+    let version_is_13 = headers.get(header::SEC_WEBSOCKET_VERSION).is_some_and(|version| version == "13");
+    let key = headers.get(header::SEC_WEBSOCKET_KEY).cloned();
+    let (true, true, true, Some(key)) =
+        (has_token(header::CONNECTION, "upgrade"), has_token(header::UPGRADE, "websocket"), version_is_13, key)
+    else {
+        let mut answer =
+            ErrorMessage::new("not_a_websocket", "expected a WebSocket handshake, version 13").response(StatusCode::UPGRADE_REQUIRED);
+        answer.headers_mut().insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
+        return answer;
+    };
+    let mut offered = tokens(headers, &header::SEC_WEBSOCKET_PROTOCOL).peekable();
+    let offers_some = offered.peek().is_some();
+    if offers_some && !offered.any(|protocol| protocol == SUBPROTOCOL) {
+        let message = format!("none of the subprotocols offered is known, expected {SUBPROTOCOL} or none at all");
+        return ErrorMessage::new("unknown_subprotocol", message).response(StatusCode::BAD_REQUEST);
+    }
+    drop(offered);
+    let upgraded = hyper::upgrade::on(&mut request);
+    let place = request.extensions().get::<Arc<Place>>().cloned();
+    tokio::spawn(async move {
+        let parts = match upgraded.await.map(hyper::upgrade::Upgraded::downcast::<TokioIo<TcpStream>>) {
+            Ok(Ok(parts)) => parts,
+            Ok(Err(_)) => return tracing::error!("an upgraded connection is not the TCP stream it was"),
+            Err(error) => return tracing::debug!(%error, "the upgrade did not happen"),
+        };
+        let mut stream = parts.io.into_inner();
+        // The first frames go around the WebSocket's write buffer, which would keep their size for as long as it lives.
+        let written = tokio::time::timeout(FIRST_WRITE_TIMEOUT, tokio::io::AsyncWriteExt::write_all(&mut stream, &first)).await;
+        if !matches!(written, Ok(Ok(()))) {
+            return;
+        }
+        drop(first);
+        talk(WebSocketStream::from_partially_read(stream, parts.read_buf.to_vec(), Role::Server, Some(config)).await).await;
+        drop(place);
+    });
+    let mut answer = Response::new(Body::empty());
+    *answer.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
+    let accept = HeaderValue::from_str(&derive_accept_key(key.as_bytes())).expect("base64 is a header value");
+    answer.headers_mut().insert(header::SEC_WEBSOCKET_ACCEPT, accept);
+    answer.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("upgrade"));
+    answer.headers_mut().insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+    if offers_some {
+        answer.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
+    }
+    answer
+}
+
+/// The comma-separated words of all headers called `name`.
+fn tokens<'a>(headers: &'a HeaderMap, name: &header::HeaderName) -> impl Iterator<Item = &'a str> {
+    headers
+        .get_all(name)
+        .into_iter()
+        .filter_map(|value| value.to_str().ok())
+        .flat_map(|value| value.split(','))
+        .map(str::trim)
+        .filter(|word| !word.is_empty())
+}
+
+/// The bytes of one whole frame from a server: `opcode` with FIN, no mask (RFC 6455, 5.2).
+pub(crate) fn frame_bytes(opcode: u8, payload: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(payload.len() + 10);
+    bytes.push(0x80 | opcode);
+    match payload.len() {
+        len @ 0..=125 => bytes.push(len as u8),
+        len @ 126..=0xFFFF => {
+            bytes.push(126);
+            bytes.extend((len as u16).to_be_bytes());
+        }
+        len => {
+            bytes.push(127);
+            bytes.extend((len as u64).to_be_bytes());
+        }
+    }
+    bytes.extend(payload);
+    bytes
+}
+
+/// Sends one message within `timeout`.
+pub(crate) async fn send(socket: &mut Socket, message: Message, timeout: Duration) -> Result<(), Stop> {
+    match tokio::time::timeout(timeout, socket.send(message)).await {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(_)) => Err(Stop::Gone("connection_lost")),
+        Err(_) => Err(Stop::Gone("write_timeout")),
+    }
+}
+
+/// Sends `value` as JSON text within `timeout`.
+pub(crate) async fn send_json(socket: &mut Socket, value: &impl Serialize, timeout: Duration) -> Result<(), Stop> {
+    let text = serde_json::to_string(value).expect("plain data can be written");
+    send(socket, Message::text(text), timeout).await
+}
+
+/// Tells the peer why, closes, and waits a little for its answer: what is unread when a connection is cut would take the
+/// last message with it.
+pub(crate) async fn close(mut socket: Socket, ending: &Ending) {
+    let farewell = async {
+        if let Some(error) = &ending.error {
+            let text = serde_json::to_string(error).expect("plain data can be written");
+            socket.feed(Message::text(text)).await?;
+        }
+        // A control frame holds 125 bytes, two of them the code.
+        let reason: String = ending
+            .reason
+            .chars()
+            .scan(0, |len, c| {
+                *len += c.len_utf8();
+                (*len <= 120).then_some(c)
+            })
+            .collect();
+        socket.send(Message::Close(Some(CloseFrame { code: ending.code, reason: reason.into() }))).await?;
+        while socket.next().await.is_some_and(|message| message.is_ok()) {}
+        Ok::<(), Error>(())
+    };
+    // Whether the peer still listened is its own affair.
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, farewell).await;
+}

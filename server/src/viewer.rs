@@ -1,0 +1,255 @@
+//! One viewer: it gets the newest state and nothing else, however slow it is.
+//!
+//! Kernel buffers at both ends hold more than a thousand packets, most of them at the viewer's end where no option of ours
+//! reaches. So the server looks at what the viewer has *read*: pings travel between the packets, a viewer that reads answers
+//! them, and no more than [`WINDOW`] of packets goes out unanswered. What a sleeping viewer misses is never sent.
+
+use crate::config::seconds;
+use crate::room::{Latest, Viewing};
+use crate::service::{Hub, stopped};
+use crate::socket::{Ending, ErrorMessage, Socket, Stop, close, frame_bytes};
+use futures_util::{SinkExt, StreamExt};
+use rhytid_shared::RoomName;
+use rhytid_shared::view::{ViewHello, ViewMessage};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::time::Instant;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+use tokio_tungstenite::tungstenite::{Bytes, Message};
+
+/// A ping goes with a packet at most this often: seldom enough to cost nothing, often enough to notice sleep.
+const PING_SPACING: Duration = Duration::from_millis(120);
+/// For this long packets go out while a ping is unanswered; longer than most round trips, and with [`PING_SPACING`]
+/// shorter than the half second of old packets that a viewer may find when it wakes.
+const WINDOW: Duration = Duration::from_millis(300);
+
+/// Small buffers: a viewer sends nothing but pongs, and gets less than 100 bytes at a time.
+pub(crate) fn socket_config() -> WebSocketConfig {
+    const READ: usize = 256;
+    const WRITE: usize = 512;
+    const LARGEST_MESSAGE: usize = 1024;
+    WebSocketConfig::default()
+        .read_buffer_size(READ)
+        .write_buffer_size(WRITE)
+        // Room for a state as JSON and a control frame behind it.
+        .max_write_buffer_size(256 << 10)
+        .max_message_size(Some(LARGEST_MESSAGE))
+        .max_frame_size(Some(LARGEST_MESSAGE))
+}
+
+/// What a viewer gets before its first packet: a ping, which shows whether it answers pings at all, and the hello.
+pub(crate) fn first_frames(hub: &Hub, room: &RoomName) -> Vec<u8> {
+    const TEXT: u8 = 1;
+    const PING: u8 = 9;
+    let hello = ViewMessage::Hello(ViewHello::new(room.as_str(), &hub.character, hub.character_url.clone()));
+    let text = serde_json::to_string(&hello).expect("plain data can be written");
+    let mut bytes = frame_bytes(PING, &[]);
+    bytes.extend(frame_bytes(TEXT, text.as_bytes()));
+    bytes
+}
+
+/// Sends `viewing`'s states until one side ends it.
+pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing, wants_json: bool) {
+    let mut pace = Pace::new(Instant::now());
+    let stop = run(&hub, &mut socket, &mut viewing, wants_json, &mut pace).await;
+    drop(viewing);
+    match stop {
+        Stop::End(ending) => {
+            hub.metrics.end(ending.error.as_ref().map_or("shutdown", |error| error.code));
+            close(socket, &ending).await;
+        }
+        Stop::Gone(reason) => hub.metrics.end(reason),
+    }
+}
+
+async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: bool, pace: &mut Pace) -> Stop {
+    let timeouts = &hub.config.timeouts;
+    let (idle, ping_interval, write) = (seconds(timeouts.viewer_idle), seconds(timeouts.ping), seconds(timeouts.write));
+    let mut shutdown = hub.shutdown.clone();
+    let mut sent = Sent::default();
+    // A state that stands there already is news to this viewer.
+    viewing.slot.mark_changed();
+    loop {
+        let now = Instant::now();
+        if now >= pace.last_heard + idle {
+            let message = format!("no pong for {} seconds", timeouts.viewer_idle);
+            return Ending::error(CloseCode::Policy, ErrorMessage::new("idle", message)).into();
+        }
+        let wake = pace.next_ping(ping_interval).min(pace.last_heard + idle);
+        let has_credit = pace.has_credit(now);
+        tokio::select! {
+            biased;
+            () = stopped(&mut shutdown) => return Ending::shutdown().into(),
+            message = socket.next() => match message {
+                Some(Ok(Message::Pong(_))) => pace.hear(Instant::now()),
+                Some(Ok(Message::Close(_))) | None => return Stop::Gone("closed"),
+                // Viewers have nothing to say yet; what they say is ignored.
+                Some(Ok(_)) => {}
+                Some(Err(_)) => return Stop::Gone("connection_lost"),
+            },
+            changed = viewing.slot.changed(), if has_credit => {
+                if changed.is_err() {
+                    return Stop::Gone("closed");
+                }
+                let latest = viewing.slot.borrow_and_update().clone();
+                let Some(latest) = latest else { continue };
+                let with_ping = pace.takes_ping(Instant::now());
+                let sending = send_state(hub, socket, &latest, wants_json, with_ping, &mut sent);
+                tokio::select! {
+                    result = tokio::time::timeout(write, sending) => match result {
+                        Ok(true) => {}
+                        Ok(false) => return Stop::Gone("connection_lost"),
+                        Err(_) => return Stop::Gone("write_timeout"),
+                    },
+                    () = stopped(&mut shutdown) => return Ending::shutdown().into(),
+                }
+            }
+            () = tokio::time::sleep_until(wake) => {
+                if pace.takes_ping(Instant::now()) && !matches!(tokio::time::timeout(write, socket.send(Message::Ping(Bytes::new()))).await, Ok(Ok(()))) {
+                    return Stop::Gone("connection_lost");
+                }
+            }
+        }
+    }
+}
+
+/// What a viewer has been sent.
+#[derive(Default)]
+struct Sent {
+    /// Index of the newest state.
+    state: u64,
+    /// Index of the newest key packet.
+    key: u64,
+}
+
+/// Sends the newest state, after its key packet where the viewer has not got that. False where the connection is lost.
+async fn send_state(hub: &Hub, socket: &mut Socket, latest: &Latest, wants_json: bool, with_ping: bool, sent: &mut Sent) -> bool {
+    let text = wants_json.then(|| latest.json(&hub.layout, &hub.hello_character));
+    let mut num_bytes = 0;
+    let mut feed = async |message: Message| {
+        num_bytes += message.len();
+        socket.feed(message).await.is_ok()
+    };
+    let is_fed = (!with_ping || feed(Message::Ping(Bytes::new())).await)
+        && match text {
+            Some(text) => feed(Message::Text(text)).await,
+            None => {
+                let needs_key = sent.key != latest.key.index;
+                (!needs_key || feed(Message::Binary(latest.key.bytes.clone())).await)
+                    && match &latest.delta {
+                        Some(delta) => feed(Message::Binary(delta.clone())).await,
+                        None => true,
+                    }
+            }
+        };
+    if !is_fed || socket.flush().await.is_err() {
+        return false;
+    }
+    let metrics = &hub.metrics;
+    metrics.frames_out.inc();
+    metrics.bytes_out.inc_by(num_bytes as u64);
+    if sent.state > 0 && latest.index > sent.state + 1 {
+        metrics.drop_frames("slow_viewer", latest.index - sent.state - 1);
+    }
+    *sent = Sent { state: latest.index, key: latest.key.index };
+    true
+}
+
+/// When pings go out and how far packets may run ahead of the answers.
+struct Pace {
+    /// When the ping that is not answered yet went out.
+    unanswered: Option<Instant>,
+    last_ping: Instant,
+    last_heard: Instant,
+    /// A viewer that has never answered a ping breaks the protocol (RFC 6455, 5.5.2); it gets packets as fast as its kernel takes them,
+    /// until the idle time-out.
+    answers_pings: bool,
+}
+
+impl Pace {
+    /// The first ping went out with the hello.
+    fn new(now: Instant) -> Self {
+        Self { unanswered: Some(now), last_ping: now, last_heard: now, answers_pings: false }
+    }
+
+    fn hear(&mut self, now: Instant) {
+        self.unanswered = None;
+        self.last_heard = now;
+        self.answers_pings = true;
+    }
+
+    fn has_credit(&self, now: Instant) -> bool {
+        !self.answers_pings || self.unanswered.is_none_or(|since| now < since + WINDOW)
+    }
+
+    /// True where a ping shall go out now, which is noted.
+    fn takes_ping(&mut self, now: Instant) -> bool {
+        let is_due = self.unanswered.is_none() && now >= self.last_ping + PING_SPACING;
+        if is_due {
+            self.unanswered = Some(now);
+            self.last_ping = now;
+        }
+        is_due
+    }
+
+    /// When a socket without packets is pinged.
+    fn next_ping(&self, interval: Duration) -> Instant {
+        match self.unanswered {
+            // Far enough away: the idle time-out comes before.
+            Some(since) => since + Duration::from_secs(86_400),
+            None => self.last_ping + interval.max(PING_SPACING),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_viewer_that_stops_answering_gets_half_a_second_more_at_most() {
+        let start = Instant::now();
+        let at = |millis: u64| start + Duration::from_millis(millis);
+        let mut pace = Pace::new(start);
+        pace.hear(at(1));
+        // Frames every 40 ms; the viewer reads until 2 s and then sleeps.
+        let mut last_sent = 0;
+        for millis in (0..10_000).step_by(40) {
+            if pace.has_credit(at(millis)) {
+                last_sent = millis;
+                pace.takes_ping(at(millis));
+                if millis < 2000 {
+                    pace.hear(at(millis));
+                }
+            }
+        }
+        assert!((2200..=2500).contains(&last_sent), "last packet {last_sent} ms after the start");
+        pace.hear(at(10_000));
+        assert!(pace.has_credit(at(10_000)), "it gets the newest when it wakes");
+    }
+
+    #[test]
+    fn a_long_round_trip_slows_but_does_not_stop() {
+        let start = Instant::now();
+        let at = |millis: u64| start + Duration::from_millis(millis);
+        for (round_trip, least) in [(0, 250), (100, 250), (250, 250), (500, 150)] {
+            let mut pace = Pace::new(start);
+            pace.hear(start);
+            let (mut num_sent, mut pong) = (0, None);
+            for millis in (0..10_000).step_by(40) {
+                if pong.is_some_and(|due| millis >= due) {
+                    pace.hear(at(millis));
+                    pong = None;
+                }
+                if pace.has_credit(at(millis)) {
+                    num_sent += 1;
+                    if pace.takes_ping(at(millis)) {
+                        pong = Some(millis + round_trip);
+                    }
+                }
+            }
+            assert!(num_sent >= least, "{num_sent} of 250 frames at a round trip of {round_trip} ms");
+        }
+    }
+}
