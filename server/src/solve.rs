@@ -7,6 +7,7 @@
 
 mod calibration;
 mod config;
+mod depth;
 mod easing;
 mod error;
 mod evaluate;
@@ -24,6 +25,14 @@ mod rotation;
 mod skeleton;
 mod weight_session;
 mod weights_to_bones;
+
+/// The stages by themselves: for benchmarks, and for whoever builds another pipeline of them.
+pub mod stages {
+    pub use super::evaluate::Evaluator;
+    pub use super::filter::OneEuroBank;
+    pub use super::head_pose::{Fit, Pose, lift, refine};
+    pub use super::rbf::{FitError, Regression};
+}
 
 pub use calibration::Calibration;
 pub use config::{CalibrationConfig, ConfigError, FilterConfig, LostConfig, OneEuroConfig, SolveConfig};

@@ -2,21 +2,27 @@
 //!
 //! No frame waits for it: the first face serves as a provisional neutral. Once enough calm frames have been seen (or,
 //! for people who are never calm, after a while the calmest half of them) their per-coordinate median is the neutral.
-//! What begins with a smile is mended by looking again at all calm frames twice within the first ten seconds.
+//! What begins with a smile is mended by looking again, at growing intervals, at the calm frames of the whole session;
+//! the same looks refine the depth of the performer's face.
 
 use super::config::CalibrationConfig;
-use super::head_pose::Pose;
+use super::depth::{self, Shape};
+use super::head_pose::{self, Pose};
 use super::rotation;
 use glam::{DQuat, DVec2, DVec3};
 use rhytid_shared::NUM_ARKIT_SHAPES;
 use serde::{Deserialize, Serialize};
 
-/// Samples are kept no denser than this, seconds: a 240 Hz tracker adds nothing a 30 Hz one does not.
+/// Frames are kept no denser than this, seconds, at first: a 240 Hz tracker adds nothing a 30 Hz one does not.
 const SPACING: f64 = 0.025;
-/// Samples kept: ten seconds and a little at the densest.
-const CAPACITY: usize = 420;
-/// The automatic neutral is looked at again this long after the first face, seconds.
-const SECOND_LOOKS: [f64; 2] = [5.0, 10.0];
+/// Frames kept of the whole session; when they are full, every other one goes and the spacing doubles.
+const HISTORY: usize = 256;
+/// The last frames, for a neutral that is asked for.
+const RECENT: usize = 16;
+/// Frames a look works on: with these it takes 2 ms.
+const MOST_WORKED: usize = 96;
+/// When the session is looked at again, seconds after the first face.
+const LOOKS: [f64; 5] = [5.0, 10.0, 20.0, 40.0, 80.0];
 
 /// A neutral face as it was calibrated: kept with a session so that a replay is exact.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -30,9 +36,8 @@ pub struct Calibration {
     /// True where the publisher asked for it.
     pub requested: bool,
     /// The performer's neutral points (68 for iBUG and what maps onto it, with two irises after them where the layout
-    /// has them; the sender's own otherwise), x and y in head space, metres at the character's scale. Empty for senders
-    /// of weights.
-    pub points: Vec<[f64; 2]>,
+    /// has them; the sender's own otherwise), head space, metres at the character's scale. Empty for senders of weights.
+    pub points: Vec<[f64; 3]>,
     /// Head rotation at neutral, `camera_from_head` as a quaternion (x, y, z, w).
     pub head_rotation: [f64; 4],
     /// Where the character's head pivot was at neutral, metres in the camera's frame.
@@ -42,14 +47,6 @@ pub struct Calibration {
 }
 
 impl Calibration {
-    /// The provisional neutral of the first frame.
-    pub(super) fn provisional(t: f64, points: &[DVec2], pose: &Pose, pivot: DVec3) -> Self {
-        let sample = Sample { t, speed: 0.0, rotation: pose.rotation, position: rotation::rotate(pose.rotation, pivot) + pose.translation };
-        let mut neutral = median_of(&[sample], |_| points, &[0], t);
-        neutral.num_frames = 0;
-        neutral
-    }
-
     /// The neutral of a sender of weights (or of bones, which need none).
     pub(super) fn of_weights(t: f64, weights: Option<&[f32; NUM_ARKIT_SHAPES]>, head_rotation: DQuat, head_position: DVec3) -> Self {
         Self {
@@ -79,91 +76,141 @@ impl Calibration {
     }
 }
 
-/// What is kept of a frame besides its points.
+/// What is kept of a frame besides its rays.
 #[derive(Debug, Clone, Copy)]
 struct Sample {
     t: f64,
     /// Root mean square over the points, interocular distances a second.
     speed: f64,
-    rotation: DQuat,
-    position: DVec3,
+    strain: f64,
+    pose: Pose,
 }
 
-/// How far a face is from what neutral faces look like, in interocular distances; `None` where the layout cannot tell.
+/// Frames with the rays of all their points.
+struct Frames {
+    num_points: usize,
+    samples: Vec<Sample>,
+    /// `num_points` for each sample.
+    rays: Vec<DVec2>,
+}
+
+impl Frames {
+    fn new(capacity: usize, num_points: usize) -> Self {
+        Self { num_points, samples: Vec::with_capacity(capacity), rays: Vec::with_capacity(capacity * num_points) }
+    }
+
+    fn push(&mut self, sample: Sample, rays: &[DVec2]) {
+        self.samples.push(sample);
+        self.rays.extend_from_slice(rays);
+    }
+
+    fn rays_of(&self, i: usize) -> &[DVec2] {
+        &self.rays[i * self.num_points..(i + 1) * self.num_points]
+    }
+
+    fn replace(&mut self, at: usize, sample: Sample, rays: &[DVec2]) {
+        self.samples[at] = sample;
+        self.rays[at * self.num_points..(at + 1) * self.num_points].copy_from_slice(rays);
+    }
+
+    /// Drops every other one.
+    fn thin_out(&mut self) {
+        let kept = self.samples.len().div_ceil(2);
+        for i in 1..kept {
+            self.samples[i] = self.samples[2 * i];
+            self.rays.copy_within(2 * i * self.num_points..(2 * i + 1) * self.num_points, i * self.num_points);
+        }
+        self.samples.truncate(kept);
+        self.rays.truncate(kept * self.num_points);
+    }
+}
+
+/// How far a face is from what neutral faces look like, in interocular distances.
 pub(super) type Strain = fn(&[DVec2]) -> f64;
 
 /// Collects frames and gives neutrals.
 pub(super) struct Calibrator {
     config: CalibrationConfig,
-    num_points: usize,
     strain: Option<Strain>,
-    /// Interocular distance, metres.
-    unit: f64,
-    /// A ring of samples and, at the same places, `num_points` points each.
-    samples: Vec<Sample>,
-    points: Vec<DVec2>,
-    next: usize,
+    history: Frames,
+    spacing: f64,
+    /// A ring; `oldest` is the place to be written next once it is full.
+    recent: Frames,
+    oldest: usize,
+    recent_t: f64,
     previous: Vec<DVec2>,
     previous_t: Option<f64>,
     started_at: Option<f64>,
-    /// Automatic neutrals reached; one more than the second looks taken.
-    num_reached: usize,
+    num_calm: usize,
+    num_looks: usize,
+    /// Automatic: the neutral is searched for. Otherwise it has been given and only its depth is refined.
     is_automatic: bool,
+    has_neutral: bool,
     wanted_since: Option<f64>,
 }
 
 impl Calibrator {
-    pub(super) fn new(config: &CalibrationConfig, num_points: usize, unit: f64, strain: Option<Strain>) -> Self {
+    pub(super) fn new(config: &CalibrationConfig, num_points: usize, strain: Option<Strain>) -> Self {
         Self {
             config: config.clone(),
-            num_points,
             strain,
-            unit,
-            samples: Vec::with_capacity(CAPACITY),
-            points: Vec::with_capacity(CAPACITY * num_points),
-            next: 0,
+            history: Frames::new(HISTORY, num_points),
+            spacing: SPACING,
+            recent: Frames::new(RECENT, num_points),
+            oldest: 0,
+            recent_t: f64::NEG_INFINITY,
             previous: vec![DVec2::ZERO; num_points],
             previous_t: None,
             started_at: None,
-            num_reached: 0,
+            num_calm: 0,
+            num_looks: 0,
             is_automatic: true,
+            has_neutral: false,
             wanted_since: None,
         }
     }
 
-    /// No automatic search: a neutral has been given.
+    /// No search of its own: a neutral has been given.
     pub(super) fn stop(&mut self) {
-        self.is_automatic = false;
+        (self.is_automatic, self.has_neutral) = (false, true);
+        self.num_looks = LOOKS.len();
     }
 
-    /// Takes one frame's points in head space. `pivot` is the character's head pivot.
-    pub(super) fn observe(&mut self, t: f64, points: &[DVec2], pose: &Pose, pivot: DVec3) {
+    /// Takes one frame: its rays, the pose they were placed with and the points they became in head space.
+    pub(super) fn observe(&mut self, t: f64, rays: &[DVec2], pose: &Pose, points: &[DVec2], unit: f64) {
         self.started_at.get_or_insert(t);
         let speed = self.previous_t.map(|previous| {
             let sum: f64 = points.iter().zip(&self.previous).map(|(now, before)| (*now - *before).length_squared()).sum();
-            (sum / points.len() as f64).sqrt() / ((t - previous) * self.unit)
+            (sum / points.len() as f64).sqrt() / ((t - previous) * unit)
         });
         self.previous.copy_from_slice(points);
         self.previous_t = Some(t);
-        if self.newest().is_some_and(|newest| t - newest.t < SPACING) {
+        if t - self.recent_t < SPACING {
             return;
         }
+        let is_history_due = self.num_looks < LOOKS.len() && self.history.samples.last().is_none_or(|newest| t - newest.t >= self.spacing);
         let sample = Sample {
             t,
             // The first frame's speed is unknown: last to be chosen.
             speed: speed.unwrap_or(f64::MAX),
-            rotation: pose.rotation,
-            position: rotation::rotate(pose.rotation, pivot) + pose.translation,
+            strain: self.strain.map_or(0.0, |strain| strain(points)),
+            pose: *pose,
         };
-        if self.samples.len() < CAPACITY {
-            self.samples.push(sample);
-            self.points.extend_from_slice(points);
+        if self.recent.samples.len() < RECENT {
+            self.recent.push(sample, rays);
         } else {
-            self.samples[self.next] = sample;
-            let at = self.next * self.num_points;
-            self.points[at..at + self.num_points].copy_from_slice(points);
+            self.recent.replace(self.oldest, sample, rays);
+            self.oldest = (self.oldest + 1) % RECENT;
         }
-        self.next = (self.next + 1) % CAPACITY;
+        self.recent_t = t;
+        if is_history_due {
+            if self.history.samples.len() == HISTORY {
+                self.history.thin_out();
+                self.spacing *= 2.0;
+            }
+            self.num_calm += usize::from(sample.speed < self.config.calm_speed);
+            self.history.push(sample, rays);
+        }
     }
 
     /// The face was lost: speeds across the gap mean nothing.
@@ -171,113 +218,168 @@ impl Calibrator {
         self.previous_t = None;
     }
 
-    fn newest(&self) -> Option<&Sample> {
-        self.samples.get((self.next + CAPACITY - 1) % CAPACITY)
-    }
-
     /// The publisher asks for the neutral now. Given at once where frames of the last moments are there, else as soon as
     /// they are.
-    pub(super) fn request(&mut self, t: f64) -> Option<Calibration> {
-        let found = self.look_back(t);
+    pub(super) fn request(&mut self, t: f64, shape: &mut Shape<'_>) -> Option<Calibration> {
+        let found = self.look_back(t, shape);
         if found.is_none() {
             self.wanted_since = Some(t);
         }
         found
     }
 
-    fn look_back(&mut self, t: f64) -> Option<Calibration> {
+    fn look_back(&mut self, t: f64, shape: &mut Shape<'_>) -> Option<Calibration> {
         let since = t - self.config.look_back;
-        let recent: Vec<usize> = (0..self.samples.len()).filter(|&i| self.samples[i].t >= since).collect();
+        let samples = &self.recent.samples;
+        let recent: Vec<usize> = (0..samples.len()).filter(|&i| samples[i].t >= since).collect();
         if recent.is_empty() {
             return None;
         }
-        let chosen = self.calmest_half(recent);
-        self.is_automatic = false;
-        self.wanted_since = None;
-        let mut calibration = median_of(&self.samples, |i| self.points_at(i), &chosen, t);
+        let mut calibration = median_of(&self.recent, &calmest_half(samples, recent), shape, t)?;
         calibration.requested = true;
+        (self.is_automatic, self.has_neutral) = (false, true);
+        self.wanted_since = None;
         Some(calibration)
     }
 
-    /// A neutral that has just been reached. Call once a frame, after [`Self::observe`].
-    pub(super) fn poll(&mut self, t: f64) -> Option<Calibration> {
+    /// A neutral that has just been reached. Call once a frame, after [`Self::observe`]. `current` is the neutral in use.
+    pub(super) fn poll(&mut self, t: f64, shape: &mut Shape<'_>, current: &Calibration) -> Option<Calibration> {
         if let Some(since) = self.wanted_since
             && t - since >= self.config.look_back
         {
-            return self.look_back(t);
-        }
-        if !self.is_automatic {
-            return None;
+            return self.look_back(t, shape);
         }
         let elapsed = t - self.started_at?;
-        let is_due = match self.num_reached {
-            0 => {
-                elapsed >= self.config.patience
-                    || self.samples.iter().filter(|s| s.speed < self.config.calm_speed).count() >= self.config.min_frames
-            }
-            reached => elapsed >= SECOND_LOOKS[reached - 1],
+        let is_due = if self.has_neutral {
+            LOOKS.get(self.num_looks).is_some_and(|look| elapsed >= *look)
+        } else {
+            elapsed >= self.config.patience || self.num_calm >= self.config.min_frames
         };
         if !is_due {
             return None;
         }
-        self.num_reached += 1;
-        self.is_automatic = self.num_reached <= SECOND_LOOKS.len();
-        let calm: Vec<usize> = (0..self.samples.len()).filter(|&i| self.samples[i].speed < self.config.calm_speed).collect();
-        let calm = if calm.len() >= self.config.min_frames { calm } else { self.calmest_half((0..self.samples.len()).collect()) };
-        let chosen = self.least_strained_half(calm);
-        (!chosen.is_empty()).then(|| median_of(&self.samples, |i| self.points_at(i), &chosen, t))
+        if self.has_neutral {
+            self.num_looks += 1;
+            // Strong expressions would pass for depth.
+            let relaxed = least_strained_half(&self.history.samples, (0..self.history.samples.len()).collect());
+            let stride = relaxed.len().div_ceil(MOST_WORKED).max(1);
+            let worked = relaxed.iter().step_by(stride).map(|&i| (self.history.samples[i].pose, self.history.rays_of(i)));
+            depth::refine(shape, worked);
+        }
+        self.has_neutral = true;
+        if !self.is_automatic {
+            return Some(with_depth(current, shape, t));
+        }
+        let samples = &self.history.samples;
+        let calm: Vec<usize> = (0..samples.len()).filter(|&i| samples[i].speed < self.config.calm_speed).collect();
+        let calm = if calm.len() >= self.config.min_frames { calm } else { calmest_half(samples, (0..samples.len()).collect()) };
+        let chosen = if self.strain.is_some() { least_strained_half(samples, calm) } else { calm };
+        median_of(&self.history, &chosen, shape, t)
     }
 
-    /// True for the first neutral of the session's own search; later ones only refine it.
+    /// True until the session has been looked at again: what has been reached is its first neutral.
     pub(super) fn is_first(&self) -> bool {
-        self.num_reached <= 1
-    }
-
-    fn points_at(&self, i: usize) -> &[DVec2] {
-        &self.points[i * self.num_points..(i + 1) * self.num_points]
-    }
-
-    fn calmest_half(&self, mut of: Vec<usize>) -> Vec<usize> {
-        of.sort_by(|&a, &b| self.samples[a].speed.total_cmp(&self.samples[b].speed).then(a.cmp(&b)));
-        of.truncate(of.len().div_ceil(2));
-        of
-    }
-
-    fn least_strained_half(&self, of: Vec<usize>) -> Vec<usize> {
-        let Some(strain) = self.strain else { return of };
-        let mut strained: Vec<(f64, usize)> = of.into_iter().map(|i| (strain(self.points_at(i)), i)).collect();
-        strained.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        strained.truncate(strained.len().div_ceil(2));
-        strained.into_iter().map(|(_, i)| i).collect()
+        self.num_looks == 0
     }
 }
 
-/// Per-coordinate median of the chosen samples.
-fn median_of<'a>(samples: &[Sample], points_at: impl Fn(usize) -> &'a [DVec2], chosen: &[usize], t: f64) -> Calibration {
-    let mut values = Vec::with_capacity(chosen.len());
+fn calmest_half(samples: &[Sample], mut of: Vec<usize>) -> Vec<usize> {
+    of.sort_by(|&a, &b| samples[a].speed.total_cmp(&samples[b].speed).then(a.cmp(&b)));
+    of.truncate(of.len().div_ceil(2));
+    of
+}
+
+fn least_strained_half(samples: &[Sample], mut of: Vec<usize>) -> Vec<usize> {
+    of.sort_by(|&a, &b| samples[a].strain.total_cmp(&samples[b].strain).then(a.cmp(&b)));
+    of.truncate(of.len().div_ceil(2));
+    of
+}
+
+/// Per-coordinate median of the chosen frames, placed and lifted with the shape as it is now.
+fn median_of(frames: &Frames, chosen: &[usize], shape: &Shape<'_>, t: f64) -> Option<Calibration> {
+    let stride = chosen.len().div_ceil(MOST_WORKED).max(1);
+    let num_points = frames.num_points;
+    let mut lifted = Vec::with_capacity(MOST_WORKED * num_points);
+    let (mut poses, mut squares, mut num_known) = (Vec::with_capacity(MOST_WORKED), 0.0, 0_usize);
+    for &i in chosen.iter().step_by(stride) {
+        let (sample, rays) = (&frames.samples[i], frames.rays_of(i));
+        let pose = if shape.has_perspective {
+            let Ok(fit) = head_pose::refine(Some(sample.pose), shape.model, rays, shape.stable, shape.unit) else { continue };
+            fit.pose
+        } else {
+            sample.pose
+        };
+        let matrix = pose.matrix();
+        for p in 0..num_points {
+            let point = head_pose::lift(&matrix, pose.translation, rays[p], shape.model[p].z);
+            lifted.push(DVec2::new(point.x, point.y));
+        }
+        poses.push(pose);
+        if sample.speed < f64::MAX {
+            squares += sample.speed * sample.speed;
+            num_known += 1;
+        }
+    }
+    let first = poses.first()?.rotation;
+    let mut values = Vec::with_capacity(poses.len());
     let mut median = |value_at: &dyn Fn(usize) -> f64| {
         values.clear();
-        values.extend(chosen.iter().map(|&i| value_at(i)));
+        values.extend((0..poses.len()).map(value_at));
         values.sort_by(f64::total_cmp);
         let middle = values.len() / 2;
         if values.len() % 2 == 1 { values[middle] } else { 0.5 * (values[middle - 1] + values[middle]) }
     };
-    let points = (0..points_at(chosen[0]).len()).map(|p| [median(&|i| points_at(i)[p].x), median(&|i| points_at(i)[p].y)]).collect();
-    let first = samples[chosen[0]].rotation;
-    let turn = [0, 1, 2].map(|axis| median(&|i| rotation::to_vector(first.inverse() * samples[i].rotation)[axis]));
-    let position = [0, 1, 2].map(|axis| median(&|i| samples[i].position[axis]));
-    let known: Vec<f64> = chosen.iter().map(|&i| samples[i].speed).filter(|speed| *speed < f64::MAX).collect();
-    let square: f64 = known.iter().map(|speed| speed * speed).sum();
-    Calibration {
+    let points = (0..num_points)
+        .map(|p| [median(&|i| lifted[i * num_points + p].x), median(&|i| lifted[i * num_points + p].y), shape.model[p].z])
+        .collect();
+    let turn = [0, 1, 2].map(|axis| median(&|i| rotation::to_vector(first.inverse() * poses[i].rotation)[axis]));
+    let position = [0, 1, 2].map(|axis| median(&|i| pivot_of(&poses[i], shape.pivot)[axis]));
+    Some(Calibration {
         t,
-        num_frames: chosen.len(),
-        speed: (square / known.len().max(1) as f64).sqrt(),
+        num_frames: poses.len(),
+        speed: (squares / num_known.max(1) as f64).sqrt(),
         requested: false,
         points,
         head_rotation: (first * rotation::from_vector(DVec3::from(turn))).normalize().to_array(),
         head_position: position,
         weights: None,
+    })
+}
+
+/// The neutral in use with other depths: x and y go along the ray each point had at neutral.
+fn with_depth(current: &Calibration, shape: &Shape<'_>, t: f64) -> Calibration {
+    let mut calibration = Calibration { t, ..current.clone() };
+    let neutral_pose = DQuat::from_array(current.head_rotation);
+    let head_from_camera = rotation::to_matrix(neutral_pose.inverse());
+    let camera = head_from_camera * DVec3::from(current.head_position);
+    for (point, model) in calibration.points.iter_mut().zip(shape.model.iter()) {
+        // The head's position is its pivot's; the camera lies at minus that, seen from the pivot.
+        let direction = DVec3::from(*point) - shape.pivot + camera;
+        let share = (model.z - point[2]) / direction.z;
+        point[0] += direction.x * share;
+        point[1] += direction.y * share;
+        point[2] = model.z;
     }
+    calibration
+}
+
+/// The provisional neutral of the first frame.
+pub(super) fn provisional(t: f64, points: &[DVec2], model: &[DVec3], pose: &Pose, pivot: DVec3) -> Calibration {
+    Calibration {
+        t,
+        num_frames: 0,
+        speed: 0.0,
+        requested: false,
+        points: points.iter().zip(model).map(|(p, model)| [p.x, p.y, model.z]).collect(),
+        head_rotation: pose.rotation.to_array(),
+        head_position: pivot_of(pose, pivot).to_array(),
+        weights: None,
+    }
+}
+
+/// Where a pose puts the character's head pivot, metres in the camera's frame.
+pub(super) fn pivot_of(pose: &Pose, pivot: DVec3) -> DVec3 {
+    rotation::rotate(pose.rotation, pivot) + pose.translation
 }
 
 /// Strain of iBUG's 68 points: open lips, corners pulled out, up or down, shut eyes. The proportions are those of

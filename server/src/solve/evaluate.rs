@@ -18,7 +18,7 @@ const PARALLEL: f64 = 1e-6;
 
 /// What of a character the evaluation needs.
 #[derive(Debug, Clone)]
-pub(super) struct Evaluator {
+pub struct Evaluator {
     num_bones: usize,
     num_poses: usize,
     rest: Vec<Vec3>,
@@ -32,7 +32,8 @@ pub(super) struct Evaluator {
 }
 
 impl Evaluator {
-    pub(super) fn new(character: &Character) -> Self {
+    /// Takes rest, poses, groups and modes of a character.
+    pub fn new(character: &Character) -> Self {
         let shortest = DEGENERATE * character.interocular();
         let rest: Vec<Vec3> = character.bones.iter().map(|bone| bone.rest).collect();
         let mut segments = Vec::with_capacity(character.num_poses() * rest.len());
@@ -56,7 +57,7 @@ impl Evaluator {
     }
 
     /// Writes the influences at `points`, pose-major. A point that is not finite keeps the coefficients it had.
-    pub(super) fn evaluate(&self, points: &[Vec3], influences: &mut [f32]) {
+    pub fn evaluate(&self, points: &[Vec3], influences: &mut [f32]) {
         match self.mode {
             Mode::Independent => self.project_each(points, influences),
             Mode::Joint => self.project_jointly(points, influences),

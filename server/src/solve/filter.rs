@@ -14,7 +14,7 @@ fn alpha(cutoff: f64, dt: f64) -> f64 {
 
 /// Filters of one group of coordinates; the speed is taken against the last *filtered* value, as in the authors' own code.
 #[derive(Debug, Clone)]
-pub(super) struct OneEuroBank {
+pub struct OneEuroBank {
     config: OneEuroConfig,
     /// Multiplies speeds before `beta`: one over the unit of length.
     per_unit: f64,
@@ -26,7 +26,7 @@ pub(super) struct OneEuroBank {
 
 impl OneEuroBank {
     /// `len` coordinates whose speed is measured in `unit`s a second.
-    pub(super) fn new(config: OneEuroConfig, len: usize, unit: f64) -> Self {
+    pub fn new(config: OneEuroConfig, len: usize, unit: f64) -> Self {
         Self {
             config,
             per_unit: 1.0 / unit,
@@ -38,12 +38,12 @@ impl OneEuroBank {
     }
 
     /// Forgets the past: the next sample passes as it is.
-    pub(super) fn reset(&mut self) {
+    pub fn reset(&mut self) {
         self.has_value = false;
     }
 
     /// Takes one sample of every coordinate, `dt` seconds after the last, and gives the filtered ones.
-    pub(super) fn update(&mut self, samples: &[f64], dt: f64) -> &[f64] {
+    pub fn update(&mut self, samples: &[f64], dt: f64) -> &[f64] {
         debug_assert_eq!(samples.len(), self.values.len());
         if !self.has_value || dt > LONGEST_GAP {
             self.values.copy_from_slice(samples);
@@ -69,7 +69,7 @@ impl OneEuroBank {
     }
 
     /// Lag behind a steady motion at the present mean cut-off, seconds.
-    pub(super) fn delay(&self) -> f64 {
+    pub fn delay(&self) -> f64 {
         1.0 / (TAU * self.mean_cutoff)
     }
 }

@@ -12,8 +12,8 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 const MOST_STEPS: usize = 12;
 /// Steps at most without an earlier pose.
 const MOST_FIRST_STEPS: usize = 40;
-/// A step below this, radians or fraction of the distance, ends the search.
-const SMALL_STEP: f64 = 1e-7;
+/// A step below this, radians or fraction of the distance, ends the search: five micrometres on the face.
+const SMALL_STEP: f64 = 5e-5;
 /// Residuals beyond this fraction of the interocular distance lose weight.
 const SOFT_RESIDUAL: f64 = 0.02;
 /// The cosine below which a plane of the face is seen too much from the side for a ray to meet it surely: 70 degrees.
@@ -21,15 +21,18 @@ const LEAST_FACING: f64 = 0.35;
 /// Points that spread less than this along a ray (root mean square) are no face: 0.03 degrees.
 const LEAST_SPREAD: f64 = 5e-4;
 
-/// `camera_from_head`.
+/// Rigid pose, `camera_from_head`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Pose {
-    pub(super) rotation: DQuat,
-    pub(super) translation: DVec3,
+pub struct Pose {
+    /// Unit quaternion.
+    pub rotation: DQuat,
+    /// Metres.
+    pub translation: DVec3,
 }
 
 impl Pose {
-    pub(super) fn matrix(&self) -> DMat3 {
+    /// The rotation as a matrix.
+    pub fn matrix(&self) -> DMat3 {
         rotation::to_matrix(self.rotation)
     }
 }
@@ -70,7 +73,8 @@ fn multiply(a: DVec2, b: DVec2) -> DVec2 {
     DVec2::new(a.x * b.x - a.y * b.y, a.x * b.y + a.y * b.x)
 }
 
-/// Where `pose` shows the point.
+/// Where a pose shows the point.
+#[cfg(test)]
 pub(super) fn project(rotation: &DMat3, translation: DVec3, point: DVec3) -> DVec2 {
     let p = *rotation * point + translation;
     DVec2::new(p.x, p.y) / p.z
@@ -78,12 +82,18 @@ pub(super) fn project(rotation: &DMat3, translation: DVec3, point: DVec3) -> DVe
 
 /// The point of head space on `ray` at the depth `z` of head space: what the performer's motion within the face's own
 /// plane has become. Beyond 70 degrees the ray is cut short instead of running off to the side.
-pub(super) fn lift(rotation: &DMat3, translation: DVec3, ray: DVec2, z: f64) -> DVec3 {
+pub fn lift(rotation: &DMat3, translation: DVec3, ray: DVec2, z: f64) -> DVec3 {
     let head_from_camera = rotation.transpose();
     let direction = head_from_camera * DVec3::new(ray.x, ray.y, 1.0);
     let camera = head_from_camera * translation;
     let distance = (z + camera.z) / direction.z.min(-LEAST_FACING);
     direction * distance - camera
+}
+
+/// As [`lift`], with the shift in x and y for each metre of depth.
+pub(super) fn lift_with_slope(rotation: &DMat3, translation: DVec3, ray: DVec2, z: f64) -> (DVec3, DVec2) {
+    let direction = rotation.transpose() * DVec3::new(ray.x, ray.y, 1.0);
+    (lift(rotation, translation, ray, z), DVec2::new(direction.x, direction.y) / direction.z.min(-LEAST_FACING))
 }
 
 fn check_spread(rays: &[DVec2], weights: &[(usize, f64)]) -> Result<(), SolveError> {
@@ -115,15 +125,16 @@ pub(super) fn frontal_pose(model: &[DVec3], rays: &[DVec2], weights: &[(usize, f
 
 /// A pose and how well it explains the stable points.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Fit {
-    pub(super) pose: Pose,
+pub struct Fit {
+    /// The pose.
+    pub pose: Pose,
     /// Weighted root-mean-square reprojection error, fraction of the interocular distance.
-    pub(super) error: f64,
+    pub error: f64,
 }
 
 /// Perspective pose of `model` from `rays` by damped Gauss–Newton with soft outliers, starting from `guess`.
 /// `weights` names the stable points; `unit` is the interocular distance in metres.
-pub(super) fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weights: &[(usize, f64)], unit: f64) -> Result<Fit, SolveError> {
+pub fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weights: &[(usize, f64)], unit: f64) -> Result<Fit, SolveError> {
     let (mut pose, most_steps) = match guess {
         Some(pose) => {
             check_spread(rays, weights)?;
@@ -132,19 +143,18 @@ pub(super) fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weigh
         None => (frontal_pose(model, rays, weights)?, MOST_FIRST_STEPS),
     };
     let mut damping = 1e-6;
-    let mut cost = squared_error(&pose, model, rays, weights);
+    let mut system = System::at(&pose, model, rays, weights, f64::INFINITY, unit);
     for _ in 0..most_steps {
-        let Some(step) = step_from(&pose, model, rays, weights, unit, cost, damping) else { break };
+        let Some(step) = system.step(damping) else { break };
         let turn = rotation::from_vector(DVec3::new(step[0], step[1], step[2]));
         let trial =
             Pose { rotation: (turn * pose.rotation).normalize(), translation: pose.translation + DVec3::new(step[3], step[4], step[5]) };
-        let trial_cost = squared_error(&trial, model, rays, weights);
+        let trial_system = System::at(&trial, model, rays, weights, system.cost, unit);
         let size = step[0].abs().max(step[1].abs()).max(step[2].abs())
             + step[3].abs().max(step[4].abs()).max(step[5].abs()) / pose.translation.z.abs();
         // The soft weights let a step raise the plain cost a little while it leaves an outlier behind.
-        if trial_cost <= cost * 1.05 + 1e-18 && trial.translation.z > 0.0 {
-            pose = trial;
-            cost = trial_cost;
+        if trial_system.cost <= system.cost * 1.05 + 1e-18 && trial.translation.z > 0.0 {
+            (pose, system) = (trial, trial_system);
             damping = (damping * 0.1).max(1e-9);
             if size < SMALL_STEP {
                 break;
@@ -156,61 +166,63 @@ pub(super) fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weigh
             }
         }
     }
+    let cost = system.cost;
     if !(pose.translation.is_finite() && pose.rotation.is_finite()) {
         return Err(SolveError::NoFaceShape { problem: "no head pose fits them" });
     }
     Ok(Fit { pose, error: cost.sqrt() * pose.translation.z / unit })
 }
 
-/// Weighted mean square of the residuals, in rays.
-fn squared_error(pose: &Pose, model: &[DVec3], rays: &[DVec2], weights: &[(usize, f64)]) -> f64 {
-    let matrix = pose.matrix();
-    let (mut sum, mut total) = (0.0, 0.0);
-    for &(i, weight) in weights {
-        sum += (project(&matrix, pose.translation, model[i]) - rays[i]).length_squared() * weight;
-        total += weight;
-    }
-    sum / total
+/// Normal equations of one Gauss–Newton step: rotation vector, then translation.
+struct System {
+    /// Lower triangle.
+    a: [[f64; 6]; 6],
+    b: [f64; 6],
+    /// Weighted mean square of the residuals, in rays.
+    cost: f64,
 }
 
-/// One damped step: rotation vector, then translation.
-fn step_from(
-    pose: &Pose,
-    model: &[DVec3],
-    rays: &[DVec2],
-    weights: &[(usize, f64)],
-    unit: f64,
-    cost: f64,
-    damping: f64,
-) -> Option<[f64; 6]> {
-    let matrix = pose.matrix();
-    // While the whole pose is off, every residual is large and none is an outlier.
-    let soft = (SOFT_RESIDUAL * unit / pose.translation.z).max(2.0 * cost.sqrt());
-    let (mut a, mut b) = ([[0.0; 6]; 6], [0.0; 6]);
-    for &(i, weight) in weights {
-        let turned = matrix * model[i];
-        let p = turned + pose.translation;
-        let (x, y) = (p.x / p.z, p.y / p.z);
-        let residual = rays[i] - DVec2::new(x, y);
-        let weight = weight / (1.0 + residual.length_squared() / (soft * soft));
-        let by_shift = [DVec3::new(1.0, 0.0, -x) / p.z, DVec3::new(0.0, 1.0, -y) / p.z];
-        for (gradient, residual) in by_shift.into_iter().zip([residual.x, residual.y]) {
-            let by_turn = turned.cross(gradient);
-            let row = [by_turn.x, by_turn.y, by_turn.z, gradient.x, gradient.y, gradient.z];
-            for r in 0..6 {
-                let scaled = row[r] * weight;
-                b[r] += scaled * residual;
-                for c in 0..=r {
-                    a[r][c] += scaled * row[c];
+impl System {
+    /// `last_cost` is that of the pose before: while the whole pose is off, every residual is large and none an outlier.
+    fn at(pose: &Pose, model: &[DVec3], rays: &[DVec2], weights: &[(usize, f64)], last_cost: f64, unit: f64) -> Self {
+        let matrix = pose.matrix();
+        let soft = (SOFT_RESIDUAL * unit / pose.translation.z).max(2.0 * last_cost.sqrt());
+        let per_soft_square = 1.0 / (soft * soft);
+        let (mut a, mut b, mut sum, mut total) = ([[0.0; 6]; 6], [0.0; 6], 0.0, 0.0);
+        for &(i, weight) in weights {
+            let turned = matrix * model[i];
+            let p = turned + pose.translation;
+            let per_z = 1.0 / p.z;
+            let (x, y) = (p.x * per_z, p.y * per_z);
+            let residual = rays[i] - DVec2::new(x, y);
+            let square = residual.length_squared();
+            sum += square * weight;
+            total += weight;
+            let weight = weight / (1.0 + square * per_soft_square);
+            let by_shift = [DVec3::new(per_z, 0.0, -x * per_z), DVec3::new(0.0, per_z, -y * per_z)];
+            for (gradient, residual) in by_shift.into_iter().zip([residual.x, residual.y]) {
+                let by_turn = turned.cross(gradient);
+                let row = [by_turn.x, by_turn.y, by_turn.z, gradient.x, gradient.y, gradient.z];
+                for r in 0..6 {
+                    let scaled = row[r] * weight;
+                    b[r] += scaled * residual;
+                    for c in 0..=r {
+                        a[r][c] += scaled * row[c];
+                    }
                 }
             }
         }
+        Self { a, b, cost: sum / total }
     }
-    for r in 0..6 {
-        a[r][r] *= 1.0 + damping;
+
+    fn step(&self, damping: f64) -> Option<[f64; 6]> {
+        let (mut a, mut b) = (self.a, self.b);
+        for r in 0..6 {
+            a[r][r] *= 1.0 + damping;
+        }
+        // The factorisation reads the lower triangle only.
+        solve_positive(&mut a, &mut b).then_some(b)
     }
-    // The factorisation reads the lower triangle only.
-    solve_positive(&mut a, &mut b).then_some(b)
 }
 
 #[cfg(test)]

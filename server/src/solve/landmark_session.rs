@@ -1,8 +1,9 @@
 //! One performer's landmarks through a session: head pose, neutral, smoothing, retargeting.
 
 use super::DelayReport;
-use super::calibration::{Calibration, Calibrator, ibug_strain};
+use super::calibration::{self, Calibration, Calibrator, ibug_strain};
 use super::config::SolveConfig;
+use super::depth::Shape;
 use super::easing::FaceState;
 use super::error::SolveError;
 use super::filter::{LONGEST_GAP, OneEuroBank};
@@ -18,6 +19,10 @@ use rhytid_shared::{Character, PublishHello};
 
 /// A head pose that fits badly is refused for this long, seconds; what lasts longer is no outlier.
 const LONGEST_REFUSAL: f64 = 0.5;
+/// How far, in radians, the head must have turned for half of a found depth to be believed: of points that hardly move, and
+/// of mouth and jaw, whose motion hides it.
+const STILL_SPREAD: f64 = 0.03;
+const MOVING_SPREAD: f64 = 0.12;
 /// Metres that weigh as much as a radian in the head's filter: the radius of a head.
 const HEAD_RADIUS: f64 = 0.1;
 
@@ -37,8 +42,11 @@ pub(super) struct LandmarkSession {
     pivot: DVec3,
     unit: f64,
     observation: Observation,
-    /// The performer's head: x and y of the neutral points, the character's depth; irises after the points.
+    /// The performer's neutral head; irises after the points. Depths are the character's until they are known better.
     model: Vec<DVec3>,
+    /// The character's depths, and how far a head must turn for others to be believed.
+    prior: Vec<f64>,
+    believed_spread: Vec<f64>,
     /// Points that place the head in this frame.
     placing: Vec<(usize, f64)>,
     pose: Option<Pose>,
@@ -105,9 +113,13 @@ impl LandmarkSession {
             eyelids: group_filter(Group::Eyelids, config.filter.eyelids),
             mouth: group_filter(Group::Mouth, config.filter.mouth),
             head: OneEuroBank::new(config.filter.head, 6, 1.0),
-            calibrator: Calibrator::new(&config.calibration, num, unit, points.is_ibug.then_some(ibug_strain)),
+            calibrator: Calibrator::new(&config.calibration, num, points.is_ibug.then_some(ibug_strain)),
             calibration: None,
             retarget: None,
+            prior: model.iter().map(|point| point.z).collect(),
+            believed_spread: (0..num)
+                .map(|i| if groups[i] == Group::Mouth && !points.is_stable(i) { MOVING_SPREAD } else { STILL_SPREAD })
+                .collect(),
             model,
             points,
         })
@@ -132,9 +144,33 @@ impl LandmarkSession {
 
     /// Asks for the neutral now; true where it is in use already.
     pub(super) fn calibrate(&mut self, character: &Character, t: Option<f64>) -> bool {
-        let Some(found) = self.calibrator.request(t.unwrap_or(f64::NEG_INFINITY)) else { return false };
+        let (calibrator, mut shape) = self.parts();
+        let Some(found) = calibrator.request(t.unwrap_or(f64::NEG_INFINITY), &mut shape) else { return false };
         // A face that spans no plane is no neutral: the one in use stays.
         self.adopt(character, found).is_ok()
+    }
+
+    fn poll(&mut self, t: f64) -> Option<Calibration> {
+        let current = self.calibration.take()?;
+        let (calibrator, mut shape) = self.parts();
+        let found = calibrator.poll(t, &mut shape, &current);
+        self.calibration = Some(current);
+        found
+    }
+
+    /// The search and what it works on.
+    fn parts(&mut self) -> (&mut Calibrator, Shape<'_>) {
+        let shape = Shape {
+            model: &mut self.model,
+            prior: &self.prior,
+            believed_spread: &self.believed_spread,
+            mirror: &self.points.mirror,
+            stable: &self.points.stable,
+            has_perspective: self.points.has_perspective,
+            unit: self.unit,
+            pivot: self.pivot,
+        };
+        (&mut self.calibrator, shape)
     }
 
     /// The tracker lost the face.
@@ -166,15 +202,15 @@ impl LandmarkSession {
         self.lift(&pose);
         let is_first = self.retarget.is_none();
         if is_first {
-            let provisional = Calibration::provisional(t, &self.lifted, &pose, self.pivot);
+            let provisional = calibration::provisional(t, &self.lifted, &self.model, &pose, self.pivot);
             self.adopt(character, provisional)?;
         }
         let dt = self.last_t.map_or(f64::INFINITY, |last| t - last);
         (self.pose, self.refused_since, self.last_t) = (Some(pose), refused_since, Some(t));
         let mut solved = Solved { is_new_neutral: false, is_to_report: false };
         if refused_since.is_none() {
-            self.calibrator.observe(t, &self.lifted, &pose, self.pivot);
-            if let Some(found) = self.calibrator.poll(t) {
+            self.calibrator.observe(t, &self.observation.rays, &pose, &self.lifted, self.unit);
+            if let Some(found) = self.poll(t) {
                 solved.is_to_report = found.requested || self.calibrator.is_first();
                 solved.is_new_neutral = self.adopt(character, found).is_ok();
                 solved.is_to_report &= solved.is_new_neutral;
@@ -244,10 +280,10 @@ impl LandmarkSession {
 
     /// Puts a neutral to use.
     fn adopt(&mut self, character: &Character, calibration: Calibration) -> Result<(), SolveError> {
-        let neutral: Vec<DVec2> = calibration.points.iter().map(|p| DVec2::from(*p)).collect();
+        let neutral: Vec<DVec2> = calibration.points.iter().map(|p| DVec2::new(p[0], p[1])).collect();
         self.retarget = Some(Retarget::new(character, &self.points, &neutral, self.config.ridge)?);
-        for (model, neutral) in self.model.iter_mut().zip(&neutral) {
-            (model.x, model.y) = (neutral.x, neutral.y);
+        for (model, neutral) in self.model.iter_mut().zip(&calibration.points) {
+            *model = DVec3::from(*neutral);
         }
         self.calibration = Some(calibration);
         for filter in [&mut self.brows, &mut self.eyelids, &mut self.mouth] {
@@ -275,7 +311,7 @@ impl LandmarkSession {
         let (Some(pose), Some(calibration)) = (self.pose, &self.calibration) else { return };
         let neutral_from_camera = DQuat::from_array(calibration.head_rotation).inverse();
         let turn = rotation::to_vector((neutral_from_camera * pose.rotation).normalize());
-        let pivot = rotation::rotate(pose.rotation, self.pivot) + pose.translation;
+        let pivot = calibration::pivot_of(&pose, self.pivot);
         let shift = rotation::rotate(neutral_from_camera, pivot - DVec3::from(calibration.head_position)) / HEAD_RADIUS;
         let smoothed = self.head.update(&[turn.x, turn.y, turn.z, shift.x, shift.y, shift.z], dt);
         let farthest = f64::from(MAX_HEAD_TRAVEL);

@@ -52,6 +52,8 @@ pub(super) struct PointSet {
     pub(super) stable: Vec<(usize, f64)>,
     /// True where they are enough for a pose in perspective; else size, roll and place are all that is taken.
     pub(super) has_perspective: bool,
+    /// The point on the other side of the face (irises after the points, where the layout has them); itself where unknown.
+    pub(super) mirror: Vec<usize>,
     /// Centres of the regression.
     pub(super) centres: Vec<usize>,
     /// True where points are numbered as iBUG numbers them.
@@ -100,6 +102,7 @@ impl PointSet {
             irises: irises.map(|[right, left]| if mirror { [left, right] } else { [right, left] }),
             model: character.ibug68.iter().map(|p| p.as_dvec3()).collect(),
             groups: (0..NUM_IBUG).map(group_of).collect(),
+            mirror: IBUG_MIRROR.into_iter().chain(irises.iter().flat_map(|_| [NUM_IBUG + 1, NUM_IBUG])).collect(),
             stable: IBUG_STABLE.iter().map(|&i| (i, weight_of(i))).collect(),
             has_perspective: true,
             centres: (0..NUM_IBUG).filter(|&i| is_centre(i)).collect(),
@@ -115,6 +118,7 @@ impl PointSet {
         let unit = f64::from(character.interocular());
         let mut model = Vec::with_capacity(names.len());
         let mut source_of = Vec::with_capacity(names.len());
+        let mut opposite = Vec::with_capacity(names.len());
         for (index, name) in names.iter().enumerate() {
             let Some(point) = character.features.get(name) else {
                 return Err(SolveError::UnknownFeature { index, name: name.clone() });
@@ -124,7 +128,9 @@ impl PointSet {
             }
             model.push(point.as_dvec3());
             let partner = other_side(name).and_then(|other| names.iter().position(|name| *name == other));
-            source_of.push(if mirror { partner.unwrap_or(index) } else { index });
+            let partner = partner.unwrap_or(index);
+            source_of.push(if mirror { partner } else { index });
+            opposite.push(partner);
         }
         let nearest_ibug = |p: DVec3| -> (usize, f64) {
             (0..NUM_IBUG)
@@ -170,6 +176,7 @@ impl PointSet {
         Ok(Self {
             source_of,
             irises: None,
+            mirror: opposite,
             centres: (0..model.len()).collect(),
             model,
             groups,
@@ -178,6 +185,11 @@ impl PointSet {
             is_ibug: false,
             shares,
         })
+    }
+
+    /// True for points that expressions move little.
+    pub(super) fn is_stable(&self, point: usize) -> bool {
+        self.has_perspective && self.stable.iter().any(|(stable, _)| *stable == point)
     }
 
     /// The eye's points, where the layout has them.

@@ -26,7 +26,7 @@ struct Row {
 
 /// A fitted map from the plane to space.
 #[derive(Debug, Clone)]
-pub(super) struct Regression {
+pub struct Regression {
     rows: Vec<Row>,
     /// Columns: constant, x, y (in scaled coordinates).
     affine: [Vec3; 3],
@@ -37,7 +37,7 @@ pub(super) struct Regression {
 
 /// Why no map could be fitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum FitError {
+pub enum FitError {
     /// Fewer than three different points, or all on one line.
     Degenerate,
     /// A ridge below zero walks into singularities of the multiquadric: it is conditionally negative definite.
@@ -47,7 +47,7 @@ pub(super) enum FitError {
 impl Regression {
     /// Fits `targets[j]` at `sources[j]`. `ridge` is subtracted from the kernel's diagonal, in units of the scaled
     /// coordinates: the positive multiquadric is conditionally *negative* definite, so smoothing takes `K - ridge I`.
-    pub(super) fn fit(sources: &[DVec2], targets: &[DVec3], ridge: f64) -> Result<Self, FitError> {
+    pub fn fit(sources: &[DVec2], targets: &[DVec3], ridge: f64) -> Result<Self, FitError> {
         debug_assert_eq!(sources.len(), targets.len());
         if ridge.is_nan() || ridge < 0.0 {
             return Err(FitError::NegativeRidge);
@@ -85,7 +85,7 @@ impl Regression {
     }
 
     /// `F(p)`, metres.
-    pub(super) fn value(&self, p: DVec2) -> Vec3 {
+    pub fn value(&self, p: DVec2) -> Vec3 {
         let (x, y) = self.scaled(p);
         let mut sums = [[0.0_f32; LANES]; 3];
         for row in &self.rows {
@@ -104,7 +104,7 @@ impl Regression {
     }
 
     /// `dF/dx` and `dF/dy` at `p`: metres for each source unit.
-    pub(super) fn slope(&self, p: DVec2) -> [Vec3; 2] {
+    pub fn slope(&self, p: DVec2) -> [Vec3; 2] {
         let (x, y) = self.scaled(p);
         let mut along = [[[0.0_f32; LANES]; 3]; 2];
         for row in &self.rows {
