@@ -2,7 +2,19 @@
 //! how is none of its business; only the `embedded` feature links the server, to run it in this process.
 
 pub mod asset;
+pub mod film;
+pub mod link;
+mod picture_size;
+pub mod playout;
+#[cfg(feature = "embedded")]
+pub mod render_cli;
 pub mod renderer;
+pub mod spectator;
+pub mod twin;
+pub mod view;
 
 pub use asset::{AssetError, CharacterAsset};
+pub use link::{Link, LinkOptions, LinkState, LinkStats, ServerAddress};
+pub use playout::{Playout, PlayoutState, PlayoutStats};
 pub use renderer::{BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, Renderer, ViewMode};
+pub use spectator::{Spectator, Status, StatusKind};

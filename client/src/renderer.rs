@@ -8,16 +8,19 @@ mod headless;
 mod layouts;
 mod pipelines;
 mod present;
+mod read_back;
 mod shadow;
 mod studio;
-mod uniforms;
+pub mod uniforms;
 mod upload;
 mod view;
 
 pub use camera::Camera;
-pub use coefficients::{bone_major, moves_bone};
+pub use coefficients::{bone_major, moves_bone, pose_table};
 pub use frame::RenderFrame;
-pub use headless::{Headless, RenderError, required_limits};
+pub use headless::{AdapterChoice, Headless, RenderError, required_limits};
+pub use pipelines::VERTEX_LAYOUT;
+pub(crate) use read_back::read_back;
 pub use view::{BlendError, BlendMode, ViewError, ViewMode};
 
 use crate::asset::{CharacterAsset, Palette, Surface};
@@ -176,7 +179,7 @@ impl Renderer {
             at_rest = RenderFrame::at_rest(character);
             &at_rest
         };
-        let rows: Vec<[[f32; 4]; 3]> = self.palette.model_from_rest(character, frame).iter().map(rows_of).collect();
+        let rows: Vec<[[f32; 4]; 3]> = self.palette.model_from_rest(character, frame).iter().map(uniforms::rows_of).collect();
         queue.write_buffer(&self.group.palette, 0, bytemuck::cast_slice(&rows));
 
         let (num_bones, num_poses) = (character.num_bones(), character.num_poses());
@@ -206,9 +209,7 @@ impl Renderer {
             character.head_pivot + travel - frame.head.rotation * character.head_pivot,
         )
         .inverse();
-        let marks = &character.ibug68;
-        let inner_lips = (60..68).map(|landmark| marks[landmark]).sum::<Vec3>() / 8.0;
-        let half_mouth = 0.5 * marks[48].distance(marks[54]);
+        let mouth = Mouth::new(character, frame);
         let shown = |k: usize| match settings.view {
             ViewMode::Influence(None) => 1.0,
             ViewMode::Influence(Some(only)) if only == k => 1.0,
@@ -218,12 +219,13 @@ impl Renderer {
         uniforms::Frame {
             clip_from_world: settings.camera.clip_from_world(size[0] as f32 / size[1] as f32).to_cols_array_2d(),
             shadow_from_world: studio::shadow_from_world(centre, radius).to_cols_array_2d(),
-            head_from_world: rows_of(&head_from_world),
+            head_from_world: uniforms::rows_of(&head_from_world),
             eye: eye.extend(2.0 * radius / shadow::SIDE as f32).to_array(),
             lights: studio::lights(),
             sky: Vec3::from(studio::SKY).extend(0.0).to_array(),
             ground: Vec3::from(studio::GROUND).extend(0.0).to_array(),
-            mouth: inner_lips.extend(half_mouth).to_array(),
+            mouth: mouth.middle.extend(mouth.half_width).to_array(),
+            mouth_shape: [mouth.light_reach(), mouth.corner_depth, 0.0, 0.0],
             eyeballs: eyeballs(character),
             shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
         }
@@ -336,6 +338,46 @@ impl Bounds {
     }
 }
 
+/// The opening of the lips.
+struct Mouth {
+    /// Between the inner lips at rest, head space.
+    middle: Vec3,
+    /// Half its width at rest, metres.
+    half_width: f32,
+    /// How far the corners lie behind the middle, in units of `half_width`.
+    corner_depth: f32,
+    /// How far the lips are apart, in units of `half_width`.
+    gap: f32,
+}
+
+impl Mouth {
+    fn new(character: &Character, frame: &RenderFrame) -> Self {
+        let marks = &character.ibug68;
+        let (upper, lower) = (marks[62], marks[66]);
+        let middle = (upper + lower) * 0.5;
+        let half_width = (0.5 * marks[60].distance(marks[64])).max(1e-3);
+        let lift = |landmark: Vec3| {
+            let nearest = (0..character.num_bones()).min_by(|&a, &b| {
+                let distance = |bone: usize| character.bones[bone].rest.distance_squared(landmark);
+                distance(a).total_cmp(&distance(b))
+            });
+            nearest.map_or(0.0, |bone| frame.points[bone].y - character.bones[bone].rest.y)
+        };
+        Self {
+            middle,
+            half_width,
+            corner_depth: (middle.z - 0.5 * (marks[60].z + marks[64].z)) / half_width,
+            gap: (lift(upper) - lift(lower)).max(0.0) / half_width,
+        }
+    }
+
+    /// How deep light reaches, in units of `half_width`: hardly to the teeth where the lips meet, behind the tongue's
+    /// tip where they stand wide apart. Tuned by eye.
+    fn light_reach(&self) -> f32 {
+        0.32 + 1.5 * (self.gap / 0.7).min(1.0)
+    }
+}
+
 /// Centres and radii of the eyeballs: the pivots of the eye bones, else from the landmarks. Left, then right.
 fn eyeballs(character: &Character) -> [[f32; 4]; 2] {
     use rhytid_shared::character::Side;
@@ -349,10 +391,4 @@ fn eyeballs(character: &Character) -> [[f32; 4]; 2] {
         pivot.unwrap_or_else(|| (character.ibug68[corners[0]] + character.ibug68[corners[1]]) * 0.5 - Vec3::Z * radius * 0.8)
     };
     [centre(Side::Left, [42, 45]).extend(radius).to_array(), centre(Side::Right, [36, 39]).extend(radius).to_array()]
-}
-
-/// The three rows of `target_from_source`.
-fn rows_of(transform: &Affine3A) -> [[f32; 4]; 3] {
-    let (m, t) = (transform.matrix3, transform.translation);
-    [0, 1, 2].map(|row| [m.x_axis[row], m.y_axis[row], m.z_axis[row], t[row]])
 }

@@ -1,5 +1,6 @@
 //! Pictures without a window.
 
+use super::read_back::read_back;
 use super::{DrawSettings, RenderFrame, Renderer};
 use crate::asset::CharacterAsset;
 use image::RgbaImage;
@@ -31,6 +32,15 @@ pub enum RenderError {
     ReadBack(String),
 }
 
+/// Which adapter draws.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AdapterChoice {
+    /// What the machine offers first.
+    Default,
+    /// A software one, which draws the same on every machine but for its version.
+    Software,
+}
+
 /// A device without a surface, and one character on it.
 #[derive(Debug)]
 pub struct Headless {
@@ -46,7 +56,12 @@ const FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8UnormSrgb;
 impl Headless {
     /// Opens the default adapter (`WGPU_ADAPTER_NAME` and `WGPU_BACKEND` choose another) and uploads the character.
     pub fn new(asset: &CharacterAsset) -> Result<Self, RenderError> {
-        let (adapter, device, queue) = pollster::block_on(open_device())?;
+        Self::on(asset, AdapterChoice::Default)
+    }
+
+    /// Opens the adapter asked for and uploads the character.
+    pub fn on(asset: &CharacterAsset, choice: AdapterChoice) -> Result<Self, RenderError> {
+        let (adapter, device, queue) = pollster::block_on(open_device(choice))?;
         let renderer = Renderer::new(&device, &queue, asset, FORMAT);
         Ok(Self { adapter, device, queue, renderer })
     }
@@ -63,59 +78,62 @@ impl Headless {
 
     /// Draws one picture and waits for it.
     pub fn render(&mut self, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> Result<RgbaImage, RenderError> {
+        let target = self.target(size)?;
+        let encoder = self.record(&target, size, settings, frame);
+        read_back(&self.device, &self.queue, encoder, &target, size)
+    }
+
+    /// Draws one picture, waits for it and drops it: for who measures drawing.
+    pub fn draw_only(&mut self, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> Result<(), RenderError> {
+        let target = self.target(size)?;
+        let encoder = self.record(&target, size, settings, frame);
+        self.queue.submit([encoder.finish()]);
+        self.wait()
+    }
+
+    /// Bytes of buffers and textures the renderer holds on the device.
+    pub fn gpu_bytes(&self) -> u64 {
+        self.renderer.gpu_bytes()
+    }
+
+    fn target(&self, size: [u32; 2]) -> Result<wgpu::Texture, RenderError> {
         let most = self.device.limits().max_texture_dimension_2d;
         if size.iter().any(|&side| side == 0 || side > most) {
             return Err(RenderError::Size { got: size, most });
         }
-        let extent = wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 };
-        let target = self.device.create_texture(&wgpu::TextureDescriptor {
+        Ok(self.device.create_texture(&wgpu::TextureDescriptor {
             label: Some("headless picture"),
-            size: extent,
+            size: wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 },
             mip_level_count: 1,
             sample_count: 1,
             dimension: wgpu::TextureDimension::D2,
             format: FORMAT,
             usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
             view_formats: &[],
-        });
-        let row_bytes = (size[0] * 4).next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);
-        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("headless read-back"),
-            size: u64::from(row_bytes) * u64::from(size[1]),
-            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
+        }))
+    }
+
+    fn record(&mut self, target: &wgpu::Texture, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> wgpu::CommandEncoder {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("headless frame") });
         let view = target.create_view(&wgpu::TextureViewDescriptor::default());
         self.renderer.draw(&self.device, &self.queue, &mut encoder, &view, size, settings, frame);
-        encoder.copy_texture_to_buffer(
-            target.as_image_copy(),
-            wgpu::TexelCopyBufferInfo {
-                buffer: &buffer,
-                layout: wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(row_bytes), rows_per_image: None },
-            },
-            extent,
-        );
-        self.queue.submit([encoder.finish()]);
-        let (sender, receiver) = std::sync::mpsc::channel();
-        // The receiver lives until the answer is there or the device is gone.
-        buffer.map_async(wgpu::MapMode::Read, .., move |result| drop(sender.send(result)));
-        self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|error| RenderError::ReadBack(error.to_string()))?;
-        receiver
-            .recv()
-            .map_err(|error| RenderError::ReadBack(error.to_string()))?
-            .map_err(|error| RenderError::ReadBack(error.to_string()))?;
-        let mapped = buffer.get_mapped_range(..).map_err(|error| RenderError::ReadBack(error.to_string()))?;
-        let texels = mapped.chunks_exact(row_bytes as usize).flat_map(|row| &row[..size[0] as usize * 4]).copied().collect();
-        RgbaImage::from_raw(size[0], size[1], texels).ok_or_else(|| RenderError::ReadBack("the picture came back too short".into()))
+        encoder
+    }
+
+    fn wait(&self) -> Result<(), RenderError> {
+        self.device.poll(wgpu::PollType::wait_indefinitely()).map(drop).map_err(|error| RenderError::ReadBack(error.to_string()))
     }
 }
 
-async fn open_device() -> Result<(wgpu::AdapterInfo, wgpu::Device, wgpu::Queue), RenderError> {
+async fn open_device(choice: AdapterChoice) -> Result<(wgpu::AdapterInfo, wgpu::Device, wgpu::Queue), RenderError> {
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle_from_env());
-    let adapter = wgpu::util::initialize_adapter_from_env_or_default(&instance, None)
-        .await
-        .map_err(|error| RenderError::NoAdapter(error.to_string()))?;
+    let adapter = match choice {
+        AdapterChoice::Default => wgpu::util::initialize_adapter_from_env_or_default(&instance, None).await,
+        AdapterChoice::Software => {
+            instance.request_adapter(&wgpu::RequestAdapterOptions { force_fallback_adapter: true, ..Default::default() }).await
+        }
+    }
+    .map_err(|error| RenderError::NoAdapter(error.to_string()))?;
     let info = adapter.get_info();
     let (device, queue) = adapter
         .request_device(&wgpu::DeviceDescriptor {

@@ -6,14 +6,14 @@ use glam::{Mat4, Vec3};
 
 /// Directions towards the lights in world space and their linear RGB. Tuned by eye on the default character.
 const LIGHTS: [([f32; 3], [f32; 3], f32); 4] = [
-    ([-0.50, 0.62, 0.72], [1.0, 0.955, 0.90], 1.28),
-    ([0.75, 0.10, 0.65], [0.86, 0.93, 1.0], 0.30),
-    ([0.88, 0.35, -0.62], [0.90, 0.95, 1.0], 0.95),
-    ([-0.90, 0.30, -0.70], [1.0, 0.93, 0.86], 0.55),
+    ([-0.56, 0.66, 0.70], [1.0, 0.965, 0.92], 2.10),
+    ([0.70, 0.12, 0.70], [0.88, 0.94, 1.0], 0.42),
+    ([0.88, 0.35, -0.72], [0.90, 0.95, 1.0], 0.80),
+    ([-0.90, 0.30, -0.80], [1.0, 0.93, 0.86], 0.45),
 ];
 /// Irradiance of the room from above and from below, linear RGB.
-pub const SKY: [f32; 3] = [0.205, 0.215, 0.235];
-pub const GROUND: [f32; 3] = [0.105, 0.090, 0.082];
+pub const SKY: [f32; 3] = [0.25, 0.26, 0.285];
+pub const GROUND: [f32; 3] = [0.125, 0.105, 0.095];
 
 /// The four lights, the key first.
 pub fn lights() -> [Light; 4] {

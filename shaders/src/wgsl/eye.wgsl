@@ -31,10 +31,13 @@ fn shade(in: Varyings) -> vec4<f32> {
         let arriving = frame.lights[i].radiance.rgb * occlusion * select(1.0, visible, i == 0u);
         // The white lets light through, so it turns dark late.
         light_in += arriving * max((dot(normal, light) + 0.2) / 1.44, 0.0);
-        film += arriving * highlight(normal, view, light, FILM_ROUGHNESS, F0) * 0.25;
+        if i > 1u {
+            // Key and fill are seen in the film as soft boxes.
+            film += arriving * highlight(normal, view, light, FILM_ROUGHNESS, F0) * 0.25;
+        }
     }
     let reflected = reflect(-view, normal);
-    film += studio_reflection(reflected, FILM_ROUGHNESS) * ambient_fresnel(F0, FILM_ROUGHNESS, clamp(dot(normal, view), 0.0, 1.0)) * occlusion;
+    film += studio_reflection(reflected) * ambient_fresnel(F0, FILM_ROUGHNESS, clamp(dot(normal, view), 0.0, 1.0)) * mix(0.3, 1.0, occlusion);
     return vec4<f32>(min(albedo * light_in + film, vec3<f32>(BRIGHTEST)), 1.0);
 }
 

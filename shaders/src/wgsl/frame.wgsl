@@ -22,6 +22,8 @@ struct Frame {
     ground: vec4<f32>,
     // Middle of the inner lips in head space; w: half the mouth's width.
     mouth: vec4<f32>,
+    // x: how deep light reaches into the mouth. y: how far its corners lie behind its middle. In units of mouth.w.
+    mouth_shape: vec4<f32>,
     // Centres of the eyeballs in head space, left and right; w: radius.
     eyeballs: array<vec4<f32>, 2>,
     // Influence view: 1 for each pose shown.

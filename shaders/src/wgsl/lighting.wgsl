@@ -7,12 +7,12 @@ const PI: f32 = 3.14159265;
 // Highlights brighter than this, before exposure, would only make edges crawl when samples are averaged.
 const BRIGHTEST: f32 = 6.0;
 
-// 1 where the key light arrives, 0 in its shadow. Nine taps a texel apart, each a bilinear comparison, weighted as a tent.
+// 1 where the key light arrives, 0 in its shadow. Twenty-five taps, each a bilinear comparison, weighted as a tent.
 fn key_visibility(world: vec3<f32>, normal: vec3<f32>) -> f32 {
     let texel_metres = frame.eye.w;
     let facing = clamp(dot(normal, frame.lights[0].direction.xyz), 0.0, 1.0);
     // Moved off the surface by more the more it leans away, so that it does not shade itself.
-    let lifted = world + normal * texel_metres * (1.0 + 2.5 * (1.0 - facing));
+    let lifted = world + normal * texel_metres * (1.5 + 4.0 * (1.0 - facing));
     let clip = frame.shadow_from_world * vec4<f32>(lifted, 1.0);
     let uv = clip.xy * vec2<f32>(0.5, -0.5) + 0.5;
     let texel = 1.0 / vec2<f32>(textureDimensions(shadow_map));
@@ -20,7 +20,7 @@ fn key_visibility(world: vec3<f32>, normal: vec3<f32>) -> f32 {
     for (var y = -2; y <= 2; y += 1) {
         for (var x = -2; x <= 2; x += 1) {
             let weight = f32((3 - abs(x)) * (3 - abs(y)));
-            sum += weight * textureSampleCompareLevel(shadow_map, shadow_sampler, uv + vec2<f32>(f32(x), f32(y)) * texel * 1.25, clip.z);
+            sum += weight * textureSampleCompareLevel(shadow_map, shadow_sampler, uv + vec2<f32>(f32(x), f32(y)) * texel * 1.9, clip.z);
         }
     }
     return sum / 81.0;
@@ -32,17 +32,16 @@ fn ambient_irradiance(normal: vec3<f32>) -> vec3<f32> {
     return mix(frame.ground.rgb, frame.sky.rgb, up * up * (3.0 - 2.0 * up));
 }
 
-// What a mirror of this roughness shows of the studio: the room, the key's soft box and a strip light.
-fn studio_reflection(direction: vec3<f32>, roughness: f32) -> vec3<f32> {
-    let room = ambient_irradiance(direction) * 0.8;
-    let blur = 0.02 + 0.9 * roughness;
-    let from_key = 1.0 - dot(direction, frame.lights[0].direction.xyz);
-    let key_box = 1.0 - smoothstep(0.03, 0.03 + 0.5 * blur, from_key);
-    let from_fill = 1.0 - dot(direction, frame.lights[1].direction.xyz);
-    let fill_box = 1.0 - smoothstep(0.06, 0.06 + 0.6 * blur, from_fill);
-    // A larger blur spreads the same light.
-    let spread = 1.0 / (1.0 + 14.0 * roughness);
-    return room + (frame.lights[0].radiance.rgb * key_box * 2.2 + frame.lights[1].radiance.rgb * fill_box * 1.4) * spread;
+// What a rough mirror shows of the room; the lights' own highlights are added light by light.
+fn room_reflection(direction: vec3<f32>) -> vec3<f32> {
+    return ambient_irradiance(direction) * 0.8;
+}
+
+// What a wet, sharp mirror shows: the room, and the key and fill as the soft boxes they are.
+fn studio_reflection(direction: vec3<f32>) -> vec3<f32> {
+    let key_box = 1.0 - smoothstep(0.020, 0.032, 1.0 - dot(direction, frame.lights[0].direction.xyz));
+    let fill_box = 1.0 - smoothstep(0.015, 0.045, 1.0 - dot(direction, frame.lights[1].direction.xyz));
+    return room_reflection(direction) * 0.5 + frame.lights[0].radiance.rgb * key_box * 9.0 + frame.lights[1].radiance.rgb * fill_box * 4.0;
 }
 
 // Trowbridge-Reitz distribution.
@@ -85,12 +84,14 @@ fn roughness_seen_from_afar(roughness: f32, normal: vec3<f32>) -> f32 {
     return sqrt(sqrt(clamp(alpha * alpha + variance, 0.0, 1.0)));
 }
 
-// Inside the mouth it is the darker the deeper: 1 at the lips, towards 0 behind the teeth.
+// Inside the mouth it is the darker the deeper: 1 at the lips, towards 0 behind the teeth; light reaches further the
+// wider the mouth is open.
 fn mouth_light(rest: vec3<f32>) -> f32 {
-    let offset = rest - frame.mouth.xyz;
     let half_width = frame.mouth.w;
-    let depth = -offset.z / half_width;
-    let inside = (1.0 - smoothstep(0.9, 1.25, abs(offset.x) / half_width)) * (1.0 - smoothstep(0.7, 1.0, abs(offset.y) / half_width));
+    let offset = (rest - frame.mouth.xyz) / half_width;
+    // The lips curve back towards their corners.
+    let depth = -offset.z - offset.x * offset.x * frame.mouth_shape.y;
+    let inside = (1.0 - smoothstep(0.85, 1.1, abs(offset.x))) * (1.0 - smoothstep(0.7, 1.0, abs(offset.y)));
     let is_mouth = inside * (1.0 - smoothstep(2.6, 3.0, depth));
-    return 1.0 - is_mouth * smoothstep(0.15, 1.5, depth);
+    return 1.0 - 0.98 * is_mouth * smoothstep(0.10, frame.mouth_shape.x, depth);
 }

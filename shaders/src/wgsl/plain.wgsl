@@ -20,7 +20,7 @@ fn shade(in: Varyings, normal: vec3<f32>) -> vec4<f32> {
         light_in += arriving * max((dot(normal, light) + 0.1) / 1.21, 0.0);
         specular += arriving * highlight(normal, view, light, roughness, F0);
     }
-    specular += studio_reflection(reflect(-view, normal), roughness) * ambient_fresnel(F0, roughness, clamp(dot(normal, view), 0.0, 1.0)) * occlusion * visible;
+    specular += room_reflection(reflect(-view, normal)) * ambient_fresnel(F0, roughness, clamp(dot(normal, view), 0.0, 1.0)) * occlusion * visible;
     return vec4<f32>(min(albedo * light_in + specular, vec3<f32>(BRIGHTEST)), 1.0);
 }
 

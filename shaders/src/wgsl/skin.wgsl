@@ -3,7 +3,7 @@
 //!include lighting
 
 // How much of the fine normal each colour loses, and how far each wraps past the terminator. Tuned by eye.
-const SMOOTHED: vec3<f32> = vec3<f32>(0.42, 0.20, 0.12);
+const SMOOTHED: vec3<f32> = vec3<f32>(0.34, 0.15, 0.08);
 const WRAP: vec3<f32> = vec3<f32>(0.26, 0.11, 0.07);
 // Reflectance at normal incidence of the skin's oil (index 1.4).
 const F0: f32 = 0.028;
@@ -26,7 +26,7 @@ fn shade(in: Varyings, normal: vec3<f32>) -> vec4<f32> {
 
     let visible = key_visibility(in.world, smooth_normal);
     // Light that enters beside a shadow's edge comes out under it, red the most.
-    let key_light = vec3<f32>(mix(visible, sqrt(visible), 0.45), mix(visible, sqrt(visible), 0.1), visible);
+    let key_light = vec3<f32>(mix(visible, sqrt(visible), 0.25), mix(visible, sqrt(visible), 0.06), visible);
 
     var diffuse_light = ambient_irradiance(mix(normal, smooth_normal, 0.4)) * occlusion;
     var specular = vec3<f32>(0.0);
@@ -45,7 +45,7 @@ fn shade(in: Varyings, normal: vec3<f32>) -> vec4<f32> {
     }
     let n_dot_v = clamp(dot(normal, view), 0.0, 1.0);
     let reflected = reflect(-view, normal);
-    specular += studio_reflection(reflected, roughness) * ambient_fresnel(F0, roughness, n_dot_v) * occlusion * occlusion * mix(0.35, 1.0, visible);
+    specular += room_reflection(reflected) * ambient_fresnel(F0, roughness, n_dot_v) * occlusion * occlusion ;
     return vec4<f32>(min(albedo * diffuse_light + specular, vec3<f32>(BRIGHTEST)), 1.0);
 }
 

@@ -9,8 +9,6 @@ const ROUGHNESS: f32 = 0.08;
 fn fs_bare(in: Varyings) -> @location(0) vec4<f32> {
     let normal = normalize(in.normal);
     let view = normalize(frame.eye.xyz - in.world);
-    var film = studio_reflection(reflect(-view, normal), ROUGHNESS) * ambient_fresnel(F0, ROUGHNESS, clamp(dot(normal, view), 0.0, 1.0));
-    let visible = key_visibility(in.world, normal);
-    film += frame.lights[0].radiance.rgb * visible * highlight(normal, view, frame.lights[0].direction.xyz, ROUGHNESS, F0) * 0.25;
+    let film = studio_reflection(reflect(-view, normal)) * ambient_fresnel(F0, ROUGHNESS, clamp(dot(normal, view), 0.0, 1.0));
     return vec4<f32>(min(film, vec3<f32>(BRIGHTEST)), 0.0);
 }
