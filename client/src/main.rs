@@ -1,7 +1,14 @@
 //! `rhytid-client`: the window, and pictures without one.
 
+use anyhow::anyhow;
 use clap::{Parser, Subcommand};
+use rhytid_client::film::{self, FilmArgs};
+#[cfg(feature = "embedded")]
 use rhytid_client::render_cli::{self, RenderArgs, StillArgs};
+use rhytid_client::view::{self, ViewArgs};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use tracing_subscriber::EnvFilter;
 
 #[derive(Parser)]
@@ -16,22 +23,50 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Show a room's face live in a window
+    View(ViewArgs),
+    /// Record a room's live face without a window: an animated picture and a contact sheet
+    Film(FilmArgs),
     /// Draw a feed file to PNG frames
+    #[cfg(feature = "embedded")]
     Render(RenderArgs),
     /// Draw one picture of a pose
+    #[cfg(feature = "embedded")]
     Still(StillArgs),
 }
 
-fn main() -> anyhow::Result<()> {
-    let cli = Cli::parse();
-    let level = ["warn", "rhytid=info", "rhytid=debug"][usize::from(cli.verbose.min(2))];
+fn main() -> ExitCode {
+    match run(Cli::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            // One line; every error here says its cause in its own words.
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(cli: Cli) -> anyhow::Result<()> {
+    let level = ["warn", "warn,rhytid=info", "warn,rhytid=debug"][usize::from(cli.verbose.min(2))];
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     match cli.command {
+        Command::View(args) => view::run(args)?,
+        Command::Film(args) => {
+            let is_stopped = Arc::new(AtomicBool::new(false));
+            let flag = Arc::clone(&is_stopped);
+            ctrlc::set_handler(move || flag.store(true, Ordering::SeqCst)).map_err(|error| anyhow!("cannot listen for Ctrl-C: {error}"))?;
+            let film = film::run(&args, &is_stopped)?;
+            println!("{} pictures in {:.1} s", film.num_pictures, film.length.as_secs_f64());
+            println!("{}", film.animation.display());
+            println!("{}", film.contact_sheet.display());
+        }
+        #[cfg(feature = "embedded")]
         Command::Render(args) => {
             let num_pictures = render_cli::render(&args)?;
             println!("{num_pictures} pictures in {}", args.out.display());
         }
+        #[cfg(feature = "embedded")]
         Command::Still(args) => render_cli::still(&args)?,
     }
     Ok(())

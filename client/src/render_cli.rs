@@ -1,6 +1,7 @@
 //! `render`: a feed file to pictures, the server's solve in this process. `still`: one picture of a pose.
 
 use crate::asset::{AssetError, CharacterAsset};
+use crate::picture_size::parse_size;
 use crate::renderer::{BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, ViewError, ViewMode};
 use glam::{Quat, Vec3};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -312,16 +313,6 @@ fn parse_weights(given: &[String]) -> Result<[f32; NUM_ARKIT_SHAPES]> {
     Ok(weights)
 }
 
-/// Largest side of a picture: what WebGPU guarantees.
-const MAX_SIDE: u32 = 8192;
-
-fn parse_size(text: &str) -> std::result::Result<[u32; 2], String> {
-    let expected = || format!("{text:?} is no size, expected WIDTHxHEIGHT in pixels, 1 to {MAX_SIDE} each");
-    let (width, height) = text.split_once('x').ok_or_else(expected)?;
-    let side = |text: &str| text.parse().ok().filter(|side| (1..=MAX_SIDE).contains(side));
-    Ok([side(width).ok_or_else(expected)?, side(height).ok_or_else(expected)?])
-}
-
 fn parse_pair(text: &str) -> std::result::Result<[f32; 2], String> {
     let expected = || format!("{text:?} is no pair, expected YAW,PITCH in degrees, -180 to 180 each");
     let (yaw, pitch) = text.split_once(',').ok_or_else(expected)?;
@@ -334,12 +325,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_and_angles_are_read_or_refused_with_what_was_expected() {
-        assert_eq!(parse_size("512x256"), Ok([512, 256]));
+    fn angles_are_read_or_refused_with_what_was_expected() {
         assert_eq!(parse_pair("-30,12.5"), Ok([-30.0, 12.5]));
-        for bad in ["512", "0x512", "512x", "9000x10", "axb"] {
-            assert!(parse_size(bad).is_err_and(|message| message.contains("expected WIDTHxHEIGHT")), "{bad}");
-        }
         for bad in ["1", "nan,0", "1,2,3", "400,0"] {
             assert!(parse_pair(bad).is_err_and(|message| message.contains("expected YAW,PITCH")), "{bad}");
         }

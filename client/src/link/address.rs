@@ -78,7 +78,9 @@ impl FromStr for ServerAddress {
             return Err(form());
         }
         let port = match authority.port() {
-            None => DEFAULT_PORT,
+            // A port beyond 65535 counts as none.
+            None if authority.as_str() == authority.host() => DEFAULT_PORT,
+            None => return Err(form()),
             Some(port) => port.as_str().parse().ok().filter(|&port| port != 0).ok_or_else(form)?,
         };
         Ok(Self { host: authority.host().to_owned(), port })

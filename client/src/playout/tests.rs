@@ -232,7 +232,7 @@ struct Weather {
     drift: f64,
     skew: i64,
     jitter: i64,
-    /// Every packet sent within the first `stall` of each `stall_every` arrives at its end (TCP).
+    /// Every packet sent within the last `stall` of each `stall_every` arrives at its end (TCP).
     stall_every: i64,
     stall: i64,
     /// One in this many is sent twice; one in this many overtakes its neighbour. 0 for never.
@@ -276,8 +276,11 @@ fn simulate(weather: Weather, seconds: i64, seed: u64) -> Seen {
         let sent = (k as f64 * 1e6 / weather.fps) as i64;
         let captured_at = weather.skew * MS + (sent as f64 * (1.0 + weather.drift)) as i64;
         let mut arrives = sent + 20 * MS + (random() % (weather.jitter * MS + 1).unsigned_abs()) as i64;
-        if weather.stall_every > 0 && sent % (weather.stall_every * MS) < weather.stall * MS {
-            arrives = arrives.max(sent - sent % (weather.stall_every * MS) + weather.stall * MS);
+        if weather.stall_every > 0 {
+            let into = sent % (weather.stall_every * MS);
+            if into >= (weather.stall_every - weather.stall) * MS {
+                arrives = arrives.max(sent - into + weather.stall_every * MS);
+            }
         }
         // A stream keeps its order unless the weather says otherwise.
         if weather.reorder_one_in == 0 || !random().is_multiple_of(weather.reorder_one_in) {
