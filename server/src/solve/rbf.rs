@@ -10,24 +10,26 @@ use glam::{DVec2, DVec3, Vec3};
 
 /// Centres are evaluated in rows of this many: partial sums that any vector unit can hold.
 const LANES: usize = 8;
+/// Centres whose distances are computed before they are summed; a multiple of the lanes.
+const BLOCK: usize = 64;
 /// Below this ratio of pivots a system counts as singular.
 const WORST_PIVOT_RATIO: f64 = 1e-12;
 /// Centres closer than this fraction of the set's size are one point.
 const DUPLICATE: f64 = 1e-6;
 
-/// One row of centres in structure-of-arrays order.
+/// Centres in structure-of-arrays order, filled up with weightless ones to whole rows.
 #[derive(Debug, Clone, Default)]
-struct Row {
-    x: [f32; LANES],
-    y: [f32; LANES],
-    shape_squared: [f32; LANES],
-    weight: [[f32; LANES]; 3],
+struct Centres {
+    x: Vec<f32>,
+    y: Vec<f32>,
+    shape_squared: Vec<f32>,
+    weight: [Vec<f32>; 3],
 }
 
 /// A fitted map from the plane to space.
 #[derive(Debug, Clone)]
 pub struct Regression {
-    rows: Vec<Row>,
+    centres: Centres,
     /// Columns: constant, x, y (in scaled coordinates).
     affine: [Vec3; 3],
     centre: DVec2,
@@ -78,7 +80,7 @@ impl Regression {
         // Variable shape first; it has no guarantee, so the classical kernels stand behind it.
         for shapes in [nearest, vec![mean; points.len()], vec![0.0; points.len()]] {
             if let Some((weights, affine)) = solve_system(&points, &values, &shapes, ridge) {
-                return Ok(Self { rows: rows_of(&points, &shapes, &weights), affine, centre, scale });
+                return Ok(Self { centres: Centres::new(&points, &shapes, &weights), affine, centre, scale });
             }
         }
         Err(FitError::Degenerate)
@@ -87,41 +89,43 @@ impl Regression {
     /// `F(p)`, metres.
     pub fn value(&self, p: DVec2) -> Vec3 {
         let (x, y) = self.scaled(p);
-        let mut sums = [[0.0_f32; LANES]; 3];
-        for row in &self.rows {
-            let mut phi = [0.0_f32; LANES];
-            for lane in 0..LANES {
-                let (dx, dy) = (x - row.x[lane], y - row.y[lane]);
-                phi[lane] = (dx * dx + dy * dy + row.shape_squared[lane]).sqrt();
+        let Centres { x: centre_x, y: centre_y, shape_squared, weight } = &self.centres;
+        let mut sums = [0.0_f32; 3];
+        // Distances first, then the sums: apart, both are loops that compilers turn into vector code.
+        let mut phi = [0.0_f32; BLOCK];
+        for start in (0..centre_x.len()).step_by(BLOCK) {
+            let num = BLOCK.min(centre_x.len() - start);
+            let phi = &mut phi[..num];
+            let (centre_x, centre_y) = (&centre_x[start..start + num], &centre_y[start..start + num]);
+            let shape_squared = &shape_squared[start..start + num];
+            for j in 0..num {
+                let (dx, dy) = (x - centre_x[j], y - centre_y[j]);
+                phi[j] = (dx * dx + dy * dy + shape_squared[j]).sqrt();
             }
             for axis in 0..3 {
-                for lane in 0..LANES {
-                    sums[axis][lane] += row.weight[axis][lane] * phi[lane];
-                }
+                sums[axis] += dot(&weight[axis][start..start + num], phi);
             }
         }
-        self.affine[0] + self.affine[1] * x + self.affine[2] * y + Vec3::from(sums.map(add_lanes))
+        self.affine[0] + self.affine[1] * x + self.affine[2] * y + Vec3::from(sums)
     }
 
     /// `dF/dx` and `dF/dy` at `p`: metres for each source unit.
     pub fn slope(&self, p: DVec2) -> [Vec3; 2] {
         let (x, y) = self.scaled(p);
-        let mut along = [[[0.0_f32; LANES]; 3]; 2];
-        for row in &self.rows {
-            for lane in 0..LANES {
-                let d = [x - row.x[lane], y - row.y[lane]];
-                let phi = (d[0] * d[0] + d[1] * d[1] + row.shape_squared[lane]).sqrt();
-                for (axis_in, along) in along.iter_mut().enumerate() {
-                    // At a centre of the linear kernel the slope is undefined; its mean over directions is zero.
-                    let part = if phi > 0.0 { d[axis_in] / phi } else { 0.0 };
-                    for axis in 0..3 {
-                        along[axis][lane] += row.weight[axis][lane] * part;
-                    }
-                }
+        let centres = &self.centres;
+        let mut along = [Vec3::ZERO; 2];
+        for j in 0..centres.x.len() {
+            let d = [x - centres.x[j], y - centres.y[j]];
+            let phi = (d[0] * d[0] + d[1] * d[1] + centres.shape_squared[j]).sqrt();
+            // At a centre of the linear kernel the slope is undefined; its mean over directions is zero.
+            if phi > 0.0 {
+                let weight = Vec3::new(centres.weight[0][j], centres.weight[1][j], centres.weight[2][j]);
+                along[0] += weight * (d[0] / phi);
+                along[1] += weight * (d[1] / phi);
             }
         }
         let scale = self.scale as f32;
-        [(self.affine[1] + Vec3::from(along[0].map(add_lanes))) * scale, (self.affine[2] + Vec3::from(along[1].map(add_lanes))) * scale]
+        [(self.affine[1] + along[0]) * scale, (self.affine[2] + along[1]) * scale]
     }
 
     fn scaled(&self, p: DVec2) -> (f32, f32) {
@@ -130,8 +134,14 @@ impl Regression {
     }
 }
 
-/// Sums eight partial sums as a tree.
-fn add_lanes(lanes: [f32; LANES]) -> f32 {
+/// Dot product with eight partial sums, added up as a tree.
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let mut lanes = [0.0_f32; LANES];
+    for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {
+        for lane in 0..LANES {
+            lanes[lane] += a[lane] * b[lane];
+        }
+    }
     ((lanes[0] + lanes[4]) + (lanes[2] + lanes[6])) + ((lanes[1] + lanes[5]) + (lanes[3] + lanes[7]))
 }
 
@@ -179,18 +189,20 @@ fn solve_system(points: &[DVec2], values: &[DVec3], shapes: &[f64], ridge: f64) 
     Some(((0..num).map(at).collect(), [num, num + 1, num + 2].map(|row| at(row).as_vec3())))
 }
 
-fn rows_of(points: &[DVec2], shapes: &[f64], weights: &[DVec3]) -> Vec<Row> {
-    let mut rows = vec![Row::default(); points.len().div_ceil(LANES)];
-    for j in 0..points.len() {
-        let (row, lane) = (&mut rows[j / LANES], j % LANES);
-        row.x[lane] = points[j].x as f32;
-        row.y[lane] = points[j].y as f32;
-        row.shape_squared[lane] = (shapes[j] * shapes[j]) as f32;
-        for axis in 0..3 {
-            row.weight[axis][lane] = weights[j][axis] as f32;
+impl Centres {
+    fn new(points: &[DVec2], shapes: &[f64], weights: &[DVec3]) -> Self {
+        let filled = |values: &mut dyn Iterator<Item = f64>| -> Vec<f32> {
+            let mut values: Vec<f32> = values.map(|value| value as f32).collect();
+            values.resize(points.len().next_multiple_of(LANES), 0.0);
+            values
+        };
+        Self {
+            x: filled(&mut points.iter().map(|p| p.x)),
+            y: filled(&mut points.iter().map(|p| p.y)),
+            shape_squared: filled(&mut shapes.iter().map(|s| s * s)),
+            weight: [0, 1, 2].map(|axis| filled(&mut weights.iter().map(|w| w[axis]))),
         }
     }
-    rows
 }
 
 #[cfg(test)]
