@@ -12,6 +12,7 @@ mod glb;
 mod landmarks;
 mod lashes;
 mod lids;
+mod lips;
 mod mesh;
 mod obj;
 mod paint;
@@ -52,7 +53,7 @@ pub fn run() -> Result<()> {
 }
 
 fn bake(source: &mut source::Source) -> Result<Vec<u8>> {
-    let base = base::Base::load(source, [landmarks::IBUG_VERTICES[0], landmarks::IBUG_VERTICES[16]])?;
+    let base = base::Base::load(source, landmarks::EARS)?;
     let eyes = [eyes::eyeball(&base, "helper-l-eye"), eyes::eyeball(&base, "helper-r-eye")];
     let skin = skin::Skin::build(&base, source, eyes)?;
     let rig = &skin.rig;

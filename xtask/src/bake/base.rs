@@ -22,9 +22,21 @@ const MACROS: [(&str, f32); 8] = [
     ("universal-female-young-averagemuscle-averageweight", 0.30),
 ];
 
-/// Expression shapes mixed into the neutral: the plain MakeHuman face reads as a frown (a tracker sees browDown 0.44).
-const NEUTRAL_SHAPES: [(&str, f32); 5] =
-    [("browDownLeft", -0.50), ("browDownRight", -0.50), ("browInnerUp", 0.15), ("browOuterUpLeft", 0.08), ("browOuterUpRight", 0.08)];
+/// Expression shapes mixed into the neutral. The plain MakeHuman face reads as a frown (a tracker sees browDown 0.44),
+/// its lips come apart by half a millimetre when the mesh is subdivided, and its eyes are a little narrow.
+const NEUTRAL_SHAPES: [(&str, f32); 11] = [
+    ("eyeWideLeft", 0.12),
+    ("eyeWideRight", 0.12),
+    ("browDownLeft", -0.50),
+    ("browDownRight", -0.50),
+    ("browInnerUp", 0.15),
+    ("browOuterUpLeft", 0.08),
+    ("browOuterUpRight", 0.08),
+    ("mouthLowerDownLeft", -0.08),
+    ("mouthLowerDownRight", -0.08),
+    ("mouthUpperUpLeft", -0.06),
+    ("mouthUpperUpRight", -0.06),
+];
 
 /// Waves of the asymmetry: `(direction and wave number, radians a metre; phase; displacement, metres)`. Long waves, so
 /// that halves differ as halves of a face do and no feature is bent. Tuned by eye; the sum stays below 1 mm.

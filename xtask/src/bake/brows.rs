@@ -31,11 +31,8 @@ const HALF_WIDTH: f32 = 0.000_13;
 /// Height of a hair's points over the skin, root to tip, metres.
 const LIFT: [f32; 4] = [-0.000_1, 0.000_45, 0.000_65, 0.000_35];
 
-/// Where the five landmarks of a brow lie along the line, from the inner one.
-pub const LANDMARKS: [f32; 5] = [0.04, 0.25, 0.49, 0.73, 0.97];
-
 /// Point of the left brow's middle line, seen from the front; `t` 0 to 1 from the nose outwards.
-pub fn line(t: f32) -> Vec2 {
+fn line(t: f32) -> Vec2 {
     Vec2::new(along(&LINE.map(|p| p.x), t), along(&LINE.map(|p| p.y), t))
 }
 

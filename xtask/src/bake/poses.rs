@@ -17,33 +17,57 @@ pub struct PoseRecipe {
     by_hand: &'static [(&'static str, Vec3)],
 }
 
-/// In the order of the file.
+const fn mm(x: f32, y: f32, z: f32) -> Vec3 {
+    Vec3::new(x * 1e-3, y * 1e-3, z * 1e-3)
+}
+
+/// In the order of the file. Brow travels after what people do (8 to 10 mm up, 5 to 6 mm down and in), which is twice as
+/// much as MakeHuman's shapes give; the mouth's come from the shapes.
 pub const POSES: [PoseRecipe; 4] = [
     PoseRecipe {
         name: "stretch",
-        shapes: &[("browInnerUp", 1.0), ("browOuterUpLeft", 1.0), ("browOuterUpRight", 1.0)],
+        shapes: &[],
         bones: &["brow_inner", "brow_mid", "brow_outer", "brow_tail", "glabella"],
-        by_hand: &[],
+        by_hand: &[
+            ("brow_inner", mm(0.0, 8.5, -0.6)),
+            ("brow_mid", mm(0.4, 9.0, -1.6)),
+            ("brow_outer", mm(1.0, 8.8, -2.4)),
+            ("brow_tail", mm(1.4, 6.0, -1.8)),
+            ("glabella", mm(0.0, 7.0, -0.2)),
+        ],
     },
     PoseRecipe {
         name: "compress",
-        shapes: &[("browDownLeft", 1.0), ("browDownRight", 1.0), ("noseSneerLeft", 1.0), ("noseSneerRight", 1.0)],
+        shapes: &[("noseSneerLeft", 1.0), ("noseSneerRight", 1.0)],
         bones: &["brow_inner", "brow_mid", "brow_outer", "glabella", "nose_wing"],
-        by_hand: &[],
+        by_hand: &[
+            ("brow_inner", mm(-2.6, -5.2, 1.4)),
+            ("brow_mid", mm(-2.2, -5.6, 1.3)),
+            ("brow_outer", mm(-1.4, -4.4, 1.0)),
+            ("glabella", mm(0.0, -5.0, 1.4)),
+            ("nose_wing", mm(0.3, 0.8, 0.0)),
+        ],
     },
     PoseRecipe {
         name: "smile",
-        shapes: &[("mouthSmileLeft", 1.0), ("mouthSmileRight", 1.0), ("cheekSquintLeft", 0.8), ("cheekSquintRight", 0.8)],
-        bones: &["lip_corner", "lip_upper_outer", "lip_lower_outer", "cheek", "nasolabial"],
-        by_hand: &[],
+        shapes: &[("mouthSmileLeft", 0.85), ("mouthSmileRight", 0.85), ("cheekSquintLeft", 0.6), ("cheekSquintRight", 0.6)],
+        bones: &["lip_corner", "lip_upper_outer", "lip_upper", "lip_lower_outer", "lip_lower", "cheek", "nasolabial"],
+        by_hand: &[("lip_corner", mm(1.5, -1.5, -0.5))],
     },
     PoseRecipe {
         name: "pucker",
-        shapes: &[("mouthPucker", 1.0), ("mouthShrugLower", 0.6)],
+        shapes: &[("mouthPucker", 1.15), ("mouthShrugLower", 0.5)],
         bones: &[
-            "lip_corner", "lip_upper_outer", "lip_upper", "lip_upper_mid", "lip_lower_outer", "lip_lower", "lip_lower_mid", "chin",
+            "lip_corner",
+            "lip_upper_outer",
+            "lip_upper",
+            "lip_upper_mid",
+            "lip_lower_outer",
+            "lip_lower",
+            "lip_lower_mid",
+            "chin",
         ],
-        by_hand: &[],
+        by_hand: &[("lip_corner", mm(-2.0, 0.0, 0.0)), ("chin", mm(0.0, 1.6, 0.3))],
     },
 ];
 

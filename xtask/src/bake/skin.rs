@@ -5,18 +5,18 @@ use super::base::{Base, mean};
 use super::brows;
 use super::bust::{Bust, Eyeball, PoseField, Region};
 use super::cut::cut_bust;
-use super::landmarks::IBUG_VERTICES;
-use super::lids;
+use super::landmarks::{BROW, IBUG_VERTICES};
+use super::{lids, lips};
 use super::mesh::{Face, Mesh};
 use super::part::{Material, Part, sparse};
 use super::poses::POSES;
 use super::regions::{self, Masks};
 use super::rig::{Places, Rig};
 use super::source::Source;
-use super::subdivide::subdivide;
+use super::subdivide::{counteract_shrinking, subdivide};
 use super::surface::Surface;
 use super::uv;
-use super::weights::{self, Lip, Weights, shape};
+use super::weights::{self, Weights, shape};
 use anyhow::{Context, Result};
 use glam::{Vec2, Vec3, Vec4};
 use rhytid_shared::ARKIT_NAMES;
@@ -56,6 +56,9 @@ impl Skin {
         let mut coarse = cut_bust(&body, uv::cap_uv)?;
         let after_cut = coarse.compact();
         new_of = new_of.into_iter().filter_map(|(old, new)| Some((old, *after_cut.get(&new)?))).collect();
+        // The rim of the cut is to be rounded by subdividing, the face is not.
+        let heights: Vec<f32> = coarse.positions.iter().map(|p| p.y).collect();
+        counteract_shrinking(&mut coarse, |v| heights[v] > KEPT_ABOVE);
         let mut mesh = subdivide(&coarse);
 
         let masks = Masks::load(source)?.sample(&mesh);
@@ -66,6 +69,8 @@ impl Skin {
         for (landmark, base_vertex) in landmark_vertices.iter_mut().zip(IBUG_VERTICES) {
             *landmark = *new_of.get(&base_vertex).with_context(|| format!("landmark vertex {base_vertex} was cut away"))?;
         }
+        let lip_sides = lips::sides(&mesh, &landmark_vertices);
+        lips::seal(&mut mesh, &regions, &lip_sides, [landmark_vertices[60], landmark_vertices[64]]);
         let landmarks = |mesh: &Mesh| landmark_vertices.map(|v| mesh.positions[v as usize]);
         let lids = lids::fields(&mesh, &regions, eyes, &landmarks(&mesh));
         lids::clear_the_ball(&mut mesh, &regions, eyes, &lids.fields);
@@ -89,12 +94,11 @@ impl Skin {
         };
         let rig = Rig::new(&places, on_skin);
 
-        let lips = lip_sides(&mesh, &ibug68);
         let jaw: Vec<f32> = weights::turn_angles(&mesh.positions, &mesh.morphs[shape("jawOpen")], jaw_pivot, 0.02)
             .into_iter()
             .map(|angle| (angle / JAW_OPEN_RADIANS).clamp(0.0, 1.0))
             .collect();
-        let weights = weights::build(&weights::Skin { mesh: &mesh, regions: &regions, lips: &lips, jaw, lids: lids.fields, jaw_pivot, jaw_open: JAW_OPEN_RADIANS }, &rig);
+        let weights = weights::build(&weights::Skin { mesh: &mesh, regions: &regions, lips: &lip_sides, jaw, lids: lids.fields, jaw_pivot, jaw_open: JAW_OPEN_RADIANS }, &rig);
         Ok(Self { mesh, regions, ibug68, eyes, rig, weights })
     }
 
@@ -169,6 +173,9 @@ impl Skin {
     }
 }
 
+/// Above this height, metres, the shape is kept through subdivision: the neck and all above.
+const KEPT_ABOVE: f32 = -0.13;
+
 /// By how much the shape `jawOpen` turns the jaw: the rigid turn of its lower teeth.
 const JAW_OPEN_RADIANS: f32 = 0.361_3;
 
@@ -191,26 +198,16 @@ fn jaw_hinge(base: &Base) -> Vec3 {
     Vec3::new(0.0, centre.y + 0.5 * shift.y - half_cot * shift.z, centre.z + 0.5 * shift.z + half_cot * shift.y)
 }
 
-/// The brows' landmarks lie on the middle line of the hair, which is not the mesh's own ridge.
+/// Puts the brows' landmarks where trackers see them.
 fn place_brow_landmarks(mesh: &Mesh, regions: &[Region], ibug68: &mut [Vec3; NUM_IBUG]) -> Result<()> {
     let surface = Surface::new(mesh, |v| matches!(regions[v], Region::Face | Region::Eyelid | Region::Body));
-    for (i, t) in brows::LANDMARKS.into_iter().enumerate() {
-        let at = brows::line(t);
+    for (i, at) in BROW.into_iter().enumerate() {
         for (landmark, side) in [(22 + i, 1.0), (21 - i, -1.0)] {
-            let hit = brows::on_front(&surface, Vec2::new(at.x * side, at.y)).context("the brow's line misses the face")?;
+            let hit = brows::on_front(&surface, Vec2::new(at.x * side, at.y)).context("a brow landmark misses the face")?;
             ibug68[landmark] = surface.position(&hit);
         }
     }
     Ok(())
-}
-
-/// Which lip each vertex is nearer to along the skin.
-fn lip_sides(mesh: &Mesh, ibug68: &[Vec3; NUM_IBUG]) -> Vec<Lip> {
-    let graph = autorig::edge_graph(mesh);
-    let starts = |landmarks: &[usize]| -> Vec<u32> { landmarks.iter().map(|&l| autorig::nearest(&mesh.positions, ibug68[l], |_| true)).collect() };
-    let upper = autorig::distances(&graph, &starts(&[49, 50, 51, 52, 53, 61, 62, 63]), f32::INFINITY);
-    let lower = autorig::distances(&graph, &starts(&[55, 56, 57, 58, 59, 65, 66, 67]), f32::INFINITY);
-    upper.iter().zip(&lower).map(|(u, l)| if u <= l { Lip::Upper } else { Lip::Lower }).collect()
 }
 
 /// Tangents along +u with handedness, per vertex, from the area-weighted UV gradients of its triangles.

@@ -4,6 +4,33 @@
 use super::mesh::{Face, Mesh, Stencil};
 use std::collections::BTreeMap;
 
+/// Moves the vertices for which `keeps` holds by what subdividing would pull them in, so that afterwards they are (nearly)
+/// where they were: lids stay on the ball, lips closed, nose and ears sharp.
+pub fn counteract_shrinking(mesh: &mut Mesh, keeps: impl Fn(usize) -> bool) {
+    let mut edges: BTreeMap<(u32, u32), Edge> = BTreeMap::new();
+    for (f, face) in mesh.faces.iter().enumerate() {
+        for (a, b) in ring(&face.vertices) {
+            edges.entry(key(a, b)).or_default().faces.push(f);
+        }
+    }
+    let face_point = |f: usize| -> Stencil {
+        let share = 1.0 / mesh.faces[f].vertices.len() as f32;
+        mesh.faces[f].vertices.iter().map(|&v| (v, share)).collect()
+    };
+    let mut stencils = vertex_points(mesh, &edges, mesh.positions.len(), &face_point);
+    for (v, stencil) in stencils.iter_mut().enumerate() {
+        // 2 p - S p for those that keep their place, p for the others.
+        if keeps(v) {
+            stencil.iter_mut().for_each(|(_, weight)| *weight = -*weight);
+            stencil.push((v as u32, 2.0));
+        } else {
+            *stencil = vec![(v as u32, 1.0)];
+        }
+    }
+    let uvs: Vec<Stencil> = (0..mesh.uvs.len() as u32).map(|t| vec![(t, 1.0)]).collect();
+    *mesh = mesh.resampled(&stencils, &uvs, mesh.faces.clone());
+}
+
 #[derive(Default)]
 struct Edge {
     faces: Vec<usize>,
@@ -148,6 +175,14 @@ mod tests {
         assert!((fine.positions[8].length() - 0.75 * 2.0_f32.sqrt()).abs() < 1e-6);
         assert!((fine.positions[25].length() - 1.0).abs() < 1e-6);
         assert!(fine.morphs[3].iter().all(|delta| delta.distance(Vec3::X) < 1e-6));
+    }
+
+    #[test]
+    fn counteracting_halves_the_shrinking_at_least() {
+        let shrunk = subdivide(&cube()).positions[7].distance(Vec3::ONE);
+        let mut kept = cube();
+        counteract_shrinking(&mut kept, |_| true);
+        assert!(subdivide(&kept).positions[7].distance(Vec3::ONE) < 0.5 * shrunk);
     }
 
     #[test]

@@ -1,60 +1,361 @@
-//! Teeth and tongue.
+//! Teeth, gums and tongue. MakeHuman's helper teeth are two bars: they only say where the arches lie.
 
 use super::base::Base;
+use super::mesh::{Face, Mesh};
 use super::part::{Binding, Material, Part, sparse};
+use super::random::Random;
 use super::rig::HEAD;
+use super::subdivide::subdivide;
 use glam::{Vec2, Vec3};
 use rhytid_shared::ARKIT_NAMES;
+use std::f32::consts::TAU;
 
-/// Both rows of teeth.
-pub fn build(base: &Base, jaw: u8) -> Part {
-    let mut part = helper(base, "helper-upper-teeth", Material::Teeth, HEAD);
-    let lower = helper(base, "helper-lower-teeth", Material::Teeth, jaw);
-    let first = part.positions.len() as u32;
-    part.positions.extend(lower.positions);
-    part.normals.extend(lower.normals);
-    part.uvs.extend(lower.uvs);
-    part.bindings.extend(lower.bindings);
-    part.triangles.extend(lower.triangles.iter().map(|t| t.map(|v| v + first)));
-    for (all, own) in part.morphs.iter_mut().zip(lower.morphs) {
-        all.extend(own.into_iter().map(|(v, delta)| (v + first, delta)));
+/// A crown: width along the arch, height, thickness from lip to tongue (all metres, after mean human crowns), and how
+/// sharp its edge is (1 a blade, 0 flat).
+struct Crown {
+    width: f32,
+    height: f32,
+    depth: f32,
+    sharpness: f32,
+}
+
+const fn crown(width_mm: f32, height_mm: f32, depth_mm: f32, sharpness: f32) -> Crown {
+    Crown { width: width_mm * 1e-3, height: height_mm * 1e-3, depth: depth_mm * 1e-3, sharpness }
+}
+
+/// From the middle backwards.
+const UPPER: [Crown; 7] = [
+    crown(8.6, 10.4, 6.6, 0.80),
+    crown(6.7, 9.4, 6.0, 0.80),
+    crown(7.7, 10.2, 7.6, 0.65),
+    crown(7.0, 8.6, 8.6, 0.25),
+    crown(6.8, 7.8, 8.6, 0.20),
+    crown(9.9, 7.2, 10.2, 0.05),
+    crown(9.4, 6.8, 10.0, 0.05),
+];
+const LOWER: [Crown; 7] = [
+    crown(5.4, 8.8, 5.8, 0.80),
+    crown(6.0, 9.0, 6.0, 0.80),
+    crown(7.0, 10.2, 7.2, 0.65),
+    crown(7.1, 8.4, 7.6, 0.30),
+    crown(7.2, 8.0, 8.0, 0.20),
+    crown(10.8, 7.2, 9.8, 0.05),
+    crown(10.2, 6.9, 9.6, 0.05),
+];
+
+/// Outer line of the arch from the middle backwards, in shares of the helper bar's half width and depth.
+const ARCH: [Vec2; 9] = [
+    Vec2::new(0.0, 0.975),
+    Vec2::new(0.277, 0.945),
+    Vec2::new(0.535, 0.860),
+    Vec2::new(0.685, 0.732),
+    Vec2::new(0.790, 0.577),
+    Vec2::new(0.872, 0.408),
+    Vec2::new(0.917, 0.274),
+    Vec2::new(0.955, 0.142),
+    Vec2::new(0.975, 0.0),
+];
+
+/// How far inside the helper bar the outer surface lies and how far the edges overlap, metres.
+const UPPER_INSET: f32 = 0.000_6;
+const LOWER_INSET: f32 = 0.002_8;
+const OVERBITE: f32 = 0.001_2;
+/// How much lower than the helper bars the teeth stand, metres: the upper ones must show below a parted upper lip.
+const DROP: f32 = 0.002_2;
+/// How far crowns reach into the gum, metres.
+const BURIED: f32 = 0.002_0;
+/// How far the gum reaches beyond the crowns' necks, metres.
+const GUM_HEIGHT: f32 = 0.008;
+
+const NUM_AROUND: u32 = 12;
+/// Heights of a crown's rings, root to edge, with their size: width, depth.
+const RINGS: [(f32, f32, f32); 8] = [
+    (0.00, 0.74, 0.86),
+    (0.20, 0.84, 0.98),
+    (0.42, 0.94, 1.00),
+    (0.64, 1.00, 0.92),
+    (0.82, 1.00, 0.80),
+    (0.93, 0.97, 0.66),
+    (0.985, 0.90, 0.52),
+    (1.0, 0.74, 0.36),
+];
+
+/// One dental arch in the frame of the head.
+struct Arch {
+    low: Vec3,
+    high: Vec3,
+    inset: f32,
+    /// -1 for the upper jaw, whose crowns grow down.
+    up: f32,
+}
+
+impl Arch {
+    fn new(base: &Base, group: &str, inset: f32, up: f32) -> Self {
+        let points = base.obj.vertices_of(group).into_iter().map(|v| base.positions[v as usize]);
+        let (low, high) = points.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)));
+        Self { low, high, inset, up }
     }
+
+    /// Point of the outer line; `u` -1 to 1 from the right end over the middle to the left one.
+    fn outer(&self, u: f32) -> Vec2 {
+        let x = u.abs().min(1.0) * (ARCH.len() - 1) as f32;
+        let i = (x as usize).min(ARCH.len() - 2);
+        let p = ARCH[i].lerp(ARCH[i + 1], x - i as f32);
+        let middle = 0.5 * (self.low.x + self.high.x);
+        let half = 0.5 * (self.high.x - self.low.x) - self.inset;
+        Vec2::new(middle + u.signum() * p.x * half, self.low.z + p.y * (self.high.z - self.inset - self.low.z))
+    }
+
+    /// Samples of the outer line: place and length from the middle, one side.
+    fn lengths(&self, side: f32) -> Vec<(Vec2, f32)> {
+        const NUM_SAMPLES: usize = 160;
+        let mut length = 0.0;
+        let mut last = self.outer(0.0);
+        (0..=NUM_SAMPLES)
+            .map(|i| {
+                let at = self.outer(side * i as f32 / NUM_SAMPLES as f32);
+                length += at.distance(last);
+                last = at;
+                (at, length)
+            })
+            .collect()
+    }
+
+    /// Height of the crowns' edges: the plane in which the two bars meet.
+    fn edge(&self, z: f32) -> f32 {
+        let t = (z - self.low.z) / (self.high.z - self.low.z);
+        let front = if self.up < 0.0 { self.low.y } else { self.high.y - 0.22 * (self.high.y - self.low.y) };
+        let back = if self.up < 0.0 { self.low.y + 0.30 * (self.high.y - self.low.y) } else { self.high.y };
+        back + (front - back) * t + self.up * OVERBITE - DROP
+    }
+}
+
+/// Both rows of teeth with their gums.
+pub fn build(base: &Base, jaw: u8) -> Part {
+    let mut part = Part {
+        material: Material::Teeth,
+        positions: Vec::new(),
+        normals: Vec::new(),
+        tangents: None,
+        uvs: Vec::new(),
+        bindings: Vec::new(),
+        morphs: vec![Vec::new(); ARKIT_NAMES.len()],
+        triangles: Vec::new(),
+    };
+    for (group, crowns, joint, inset, up) in
+        [("helper-upper-teeth", &UPPER, HEAD, UPPER_INSET, -1.0), ("helper-lower-teeth", &LOWER, jaw, LOWER_INSET, 1.0)]
+    {
+        let first = part.positions.len() as u32;
+        let arch = Arch::new(base, group, inset, up);
+        row(&mut part, &arch, crowns);
+        part.bindings.resize(part.positions.len(), Binding::rigid(joint));
+        carry(&mut part, base, group, first);
+    }
+    part.normals = smooth_normals(&part.positions, &part.triangles);
     part
 }
 
-/// The tongue.
-pub fn tongue(base: &Base, jaw: u8) -> Part {
-    helper(base, "helper-tongue", Material::Tongue, jaw)
-}
-
-/// A helper group of the base mesh, bound to one joint.
-fn helper(base: &Base, group: &str, material: Material, joint: u8) -> Part {
-    let vertices = base.obj.vertices_of(group);
-    let index_of = |v: u32| vertices.binary_search(&v).expect("the group's own vertices") as u32;
-    let positions: Vec<Vec3> = vertices.iter().map(|&v| base.positions[v as usize]).collect();
-    let mut normals = vec![Vec3::ZERO; positions.len()];
-    let mut triangles = Vec::new();
-    for polygon in &base.obj.groups[group] {
-        for i in 1..polygon.len() - 1 {
-            let triangle = [polygon[0].0, polygon[i].0, polygon[i + 1].0].map(index_of);
-            let [a, b, c] = triangle.map(|v| positions[v as usize]);
-            triangle.iter().for_each(|&v| normals[v as usize] += (b - a).cross(c - a));
-            triangles.push(triangle);
+/// Crowns and gum of one arch.
+fn row(part: &mut Part, arch: &Arch, crowns: &[Crown; 7]) {
+    let mut random = Random::new(if arch.up < 0.0 { 5 } else { 6 });
+    let mut necks: Vec<(Vec3, Vec3, f32)> = Vec::new();
+    for side in [-1.0, 1.0] {
+        let samples = arch.lengths(side);
+        let whole: f32 = crowns.iter().map(|crown| crown.width).sum();
+        let scale = (samples[samples.len() - 1].1 / whole).min(1.12);
+        let mut from = 0.0;
+        for crown in crowns {
+            let width = crown.width * scale;
+            let at = |length: f32| samples.iter().find(|sample| sample.1 >= length).map_or(samples[samples.len() - 1].0, |sample| sample.0);
+            let (start, end, middle) = (at(from), at(from + width), at(from + 0.5 * width));
+            from += width;
+            let flat = (end - start).normalize_or(Vec2::X) * side;
+            // Real rows are never quite straight.
+            let turn = 0.05 * random.signed();
+            let along = Vec3::new(flat.x + turn * flat.y, 0.0, flat.y - turn * flat.x).normalize();
+            let outwards = along.cross(Vec3::Y) * -1.0;
+            let outwards = if outwards.z * 2.0 + outwards.x * side > 0.0 { outwards } else { -outwards };
+            let edge = arch.edge(middle.y) + 0.000_35 * random.signed();
+            let height = crown.height * (1.0 + 0.03 * random.signed());
+            let neck = Vec3::new(middle.x, edge - arch.up * height, middle.y) - outwards * (0.5 * crown.depth + 0.000_3 * random.unit());
+            necks.push((neck + outwards * 0.5 * crown.depth, outwards, crown.depth));
+            push_crown(part, crown, neck, [along, Vec3::Y * arch.up, outwards], width * 0.985, height);
+        }
+        if side < 0.0 {
+            necks.reverse();
         }
     }
-    Part {
-        material,
-        normals: normals.into_iter().map(|n| n.normalize_or(Vec3::Y)).collect(),
-        tangents: None,
-        uvs: vec![Vec2::splat(0.25); positions.len()],
-        bindings: vec![Binding::rigid(joint); positions.len()],
-        morphs: (0..ARKIT_NAMES.len())
-            .map(|shape| {
-                let dense = base.dense_morph(shape);
-                sparse(vertices.iter().map(|&v| dense[v as usize]))
-            })
+    gum(part, &necks, arch.up);
+}
+
+/// A crown from its neck; `frame`: along the arch, towards the edge, towards the lip.
+fn push_crown(part: &mut Part, crown: &Crown, neck: Vec3, frame: [Vec3; 3], width: f32, height: f32) {
+    let first = part.positions.len() as u32;
+    let [along, grows, outwards] = frame;
+    for (t, w, d) in RINGS {
+        // A blade is thin at its edge, a molar keeps its depth.
+        let depth = crown.depth * (d * crown.sharpness + (0.82 + 0.18 * d) * (1.0 - crown.sharpness));
+        let y = -BURIED + t * (height + BURIED);
+        for i in 0..NUM_AROUND {
+            let (sin, cos) = libm::sincosf(TAU * i as f32 / NUM_AROUND as f32);
+            // Superellipse: between a circle and a box. The outer face stays over the neck's, the inner one recedes.
+            let square = |x: f32| x.signum() * libm::powf(x.abs(), 0.62);
+            let x = square(cos) * 0.5 * width * (w + (1.0 - w) * 0.3 * (1.0 - crown.sharpness));
+            let z = 0.5 * crown.depth - 0.5 * depth * (1.0 - square(sin)) - 0.06 * crown.depth * (2.0 * t - 1.0) * (2.0 * t - 1.0);
+            part.positions.push(neck + along * x + grows * y + outwards * z);
+            part.uvs.push(Vec2::new(i as f32 / NUM_AROUND as f32, 0.02 + 0.44 * t));
+        }
+    }
+    let top = part.positions.len() as u32;
+    let last_ring = &part.positions[(top - NUM_AROUND) as usize..];
+    let middle = last_ring.iter().copied().sum::<Vec3>() / NUM_AROUND as f32;
+    part.positions.push(middle + grows * 0.000_1);
+    part.uvs.push(Vec2::new(0.5, 0.47));
+    let is_flipped = along.cross(grows).dot(outwards) < 0.0;
+    let mut push = |t: [u32; 3]| part.triangles.push(if is_flipped { [t[0], t[2], t[1]] } else { t });
+    for i in 0..NUM_AROUND {
+        let j = (i + 1) % NUM_AROUND;
+        for ring in 0..RINGS.len() as u32 - 1 {
+            let (a, b) = (first + ring * NUM_AROUND + i, first + ring * NUM_AROUND + j);
+            push([a, a + NUM_AROUND, b]);
+            push([b, a + NUM_AROUND, b + NUM_AROUND]);
+        }
+        push([top - NUM_AROUND + i, top, top - NUM_AROUND + j]);
+    }
+}
+
+/// The gum: a band round the necks, drawn out between the crowns and back over each of them.
+fn gum(part: &mut Part, necks: &[(Vec3, Vec3, f32)], up: f32) {
+    const STEPS: usize = 4;
+    /// Across the band from the lip's side over the ridge to the tongue's: outwards in half depths, towards the root in metres.
+    const PROFILE: [(f32, f32); 7] = [(1.00, 1.0), (1.12, 0.55), (1.08, 0.15), (0.72, -0.02), (-0.9, -0.02), (-1.18, 0.2), (-1.1, 1.0)];
+    let first = part.positions.len() as u32;
+    let num_columns = (necks.len() - 1) * STEPS + 1;
+    for column in 0..num_columns {
+        let (i, f) = (column / STEPS, (column % STEPS) as f32 / STEPS as f32);
+        let (a, b) = (necks[i], necks[(i + 1).min(necks.len() - 1)]);
+        let (at, outwards, depth) = (a.0.lerp(b.0, f), a.1.lerp(b.1, f).normalize(), a.2 + (b.2 - a.2) * f);
+        let between = libm::sinf(std::f32::consts::PI * f);
+        let papilla = 0.001_9 * between * between - 0.000_2;
+        let middle = at - outwards * 0.5 * depth;
+        for (p, (out, root)) in PROFILE.into_iter().enumerate() {
+            let drop = if root > 0.9 { -GUM_HEIGHT } else { papilla - root * 0.006 };
+            let thickness = 0.5 * depth * (1.0 - 0.10 * between);
+            part.positions.push(middle + outwards * (out * thickness) + Vec3::Y * (up * drop));
+            part.uvs.push(Vec2::new(column as f32 / num_columns as f32, 0.95 - 0.4 * (p as f32 / 6.0)));
+        }
+    }
+    let width = PROFILE.len() as u32;
+    for column in 0..num_columns as u32 - 1 {
+        for p in 0..width - 1 {
+            let a = first + column * width + p;
+            let (b, c, d) = (a + 1, a + width, a + width + 1);
+            let quad = [[a, c, b], [b, c, d]];
+            part.triangles.extend(quad.map(|t| if up > 0.0 { t } else { [t[0], t[2], t[1]] }));
+        }
+    }
+}
+
+/// Gives the vertices from `first` on the rigid motion the shapes give the helper bar: its mean displacement, and for
+/// `jawOpen` that of the bar's nearest vertex, which is exact for a turn.
+fn carry(part: &mut Part, base: &Base, group: &str, first: u32) {
+    let helpers = base.obj.vertices_of(group);
+    for shape in 0..ARKIT_NAMES.len() {
+        let dense = base.dense_morph(shape);
+        if helpers.iter().all(|&v| dense[v as usize] == Vec3::ZERO) {
+            continue;
+        }
+        let fit = Affine::fit(&helpers.iter().map(|&v| (base.positions[v as usize], dense[v as usize])).collect::<Vec<_>>());
+        let deltas = part.positions[first as usize..].iter().map(|&p| fit.at(p));
+        part.morphs[shape].extend(sparse(deltas).into_iter().map(|(v, delta)| (v + first, delta)));
+    }
+}
+
+/// A displacement that is linear in the position.
+struct Affine {
+    centre: Vec3,
+    mean: Vec3,
+    linear: glam::Mat3,
+}
+
+impl Affine {
+    /// Least squares over `(position, displacement)`.
+    fn fit(samples: &[(Vec3, Vec3)]) -> Self {
+        let count = samples.len() as f32;
+        let centre = samples.iter().map(|s| s.0).sum::<Vec3>() / count;
+        let mean = samples.iter().map(|s| s.1).sum::<Vec3>() / count;
+        let (mut moments, mut products) = (glam::Mat3::ZERO, glam::Mat3::ZERO);
+        for &(p, d) in samples {
+            let arm = p - centre;
+            let outer = |a: Vec3, b: Vec3| glam::Mat3::from_cols(a * b.x, a * b.y, a * b.z);
+            moments += outer(arm, arm);
+            products += outer(d - mean, arm);
+        }
+        Self { centre, mean, linear: products * moments.inverse() }
+    }
+
+    fn at(&self, p: Vec3) -> Vec3 {
+        self.mean + self.linear * (p - self.centre)
+    }
+}
+
+fn smooth_normals(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<Vec3> {
+    let mut normals = vec![Vec3::ZERO; positions.len()];
+    for &triangle in triangles {
+        let [a, b, c] = triangle.map(|v| positions[v as usize]);
+        triangle.iter().for_each(|&v| normals[v as usize] += (b - a).cross(c - a));
+    }
+    normals.into_iter().map(|normal| normal.normalize_or(Vec3::Y)).collect()
+}
+
+/// The tongue: MakeHuman's helper, flattened (it fills the closed mouth and would bulge out of the open one), smoothed,
+/// bound to the jaw.
+pub fn tongue(base: &Base, jaw: u8) -> Part {
+    const FLATNESS: f32 = 0.66;
+    let polygons = &base.obj.groups["helper-tongue"];
+    let mut coarse = Mesh {
+        positions: base.positions.clone(),
+        morphs: (0..ARKIT_NAMES.len()).map(|shape| base.dense_morph(shape)).collect(),
+        uvs: base.obj.uvs.clone(),
+        faces: polygons
+            .iter()
+            .map(|polygon| Face { vertices: polygon.iter().map(|c| c.0).collect(), uvs: polygon.iter().map(|c| c.1).collect() })
             .collect(),
-        positions,
-        triangles,
+    };
+    coarse.compact();
+    let bottom = coarse.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
+    for position in &mut coarse.positions {
+        position.y = bottom + (position.y - bottom) * FLATNESS;
+    }
+    let mesh = subdivide(&coarse);
+    let mut uvs = vec![Vec2::ZERO; mesh.positions.len()];
+    for face in &mesh.faces {
+        face.vertices.iter().zip(&face.uvs).for_each(|(&v, &t)| uvs[v as usize] = mesh.uvs[t as usize]);
+    }
+    Part {
+        material: Material::Tongue,
+        normals: mesh.normals(&mesh.positions),
+        tangents: None,
+        uvs,
+        bindings: vec![Binding::rigid(jaw); mesh.positions.len()],
+        morphs: mesh.morphs.iter().map(|shape| sparse(shape.iter().copied())).collect(),
+        triangles: mesh.triangles().into_iter().map(|triangle| triangle.map(|corner| corner.0)).collect(),
+        positions: mesh.positions,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn affine_fit_recovers_a_turn() {
+        let turn = |p: Vec3| Vec3::new(0.0, -0.1 * p.z, 0.1 * p.y) + Vec3::new(0.0, 0.01, 0.0);
+        let samples: Vec<(Vec3, Vec3)> = (0..20)
+            .map(|i| Vec3::new(libm::sinf(i as f32), libm::cosf(2.3 * i as f32), libm::sinf(1.1 * i as f32 + 1.0)))
+            .map(|p| (p, turn(p)))
+            .collect();
+        let p = Vec3::new(0.4, -0.2, 0.9);
+        assert!(Affine::fit(&samples).at(p).distance(turn(p)) < 1e-5);
     }
 }
