@@ -258,14 +258,12 @@ impl Calibrator {
         if !is_due {
             return None;
         }
-        if self.has_neutral {
-            self.num_looks += 1;
-            // Strong expressions would pass for depth.
-            let relaxed = least_strained_half(&self.history.samples, (0..self.history.samples.len()).collect());
-            let stride = relaxed.len().div_ceil(MOST_WORKED).max(1);
-            let worked = relaxed.iter().step_by(stride).map(|&i| (self.history.samples[i].pose, self.history.rays_of(i)));
-            depth::refine(shape, worked);
-        }
+        self.num_looks += usize::from(self.has_neutral);
+        // Strong expressions would pass for depth.
+        let relaxed = least_strained_half(&self.history.samples, (0..self.history.samples.len()).collect());
+        let stride = relaxed.len().div_ceil(MOST_WORKED).max(1);
+        let worked = relaxed.iter().step_by(stride).map(|&i| (self.history.samples[i].pose, self.history.rays_of(i)));
+        depth::refine(shape, worked);
         self.has_neutral = true;
         if !self.is_automatic {
             return Some(with_depth(current, shape, t));
