@@ -29,7 +29,7 @@ use layouts::Layouts;
 use pipelines::{Key, Look, Pipelines};
 use present::{Presenter, Targets};
 use rhytid_shared::Character;
-use rhytid_shared::character::Drive;
+use rhytid_shared::character::{Bone, Drive};
 use shadow::Shadow;
 use std::sync::Arc;
 use upload::{CharacterGroup, Primitive, Uploader};
@@ -356,18 +356,24 @@ impl Mouth {
         let (upper, lower) = (marks[62], marks[66]);
         let middle = (upper + lower) * 0.5;
         let half_width = (0.5 * marks[60].distance(marks[64])).max(1e-3);
-        let lift = |landmark: Vec3| {
-            let nearest = (0..character.num_bones()).min_by(|&a, &b| {
-                let distance = |bone: usize| character.bones[bone].rest.distance_squared(landmark);
-                distance(a).total_cmp(&distance(b))
+        // The bone that follows the inner lip; where none does, the nearest.
+        let share = |bone: &Bone, landmark: usize| match &bone.drive {
+            Drive::Skin { landmarks } => landmarks.iter().filter(|entry| entry.landmark == landmark).map(|entry| entry.weight).sum(),
+            _ => 0.0_f32,
+        };
+        let lift = |landmark: usize| {
+            let best = (0..character.num_bones()).max_by(|&a, &b| {
+                let [(share_a, far_a), (share_b, far_b)] =
+                    [a, b].map(|i| (share(&character.bones[i], landmark), character.bones[i].rest.distance_squared(marks[landmark])));
+                share_a.total_cmp(&share_b).then(far_b.total_cmp(&far_a))
             });
-            nearest.map_or(0.0, |bone| frame.points[bone].y - character.bones[bone].rest.y)
+            best.map_or(0.0, |bone| frame.points[bone].y - character.bones[bone].rest.y)
         };
         Self {
             middle,
             half_width,
             corner_depth: (middle.z - 0.5 * (marks[60].z + marks[64].z)) / half_width,
-            gap: (lift(upper) - lift(lower)).max(0.0) / half_width,
+            gap: (lift(62) - lift(66)).max(0.0) / half_width,
         }
     }
 
