@@ -25,15 +25,20 @@ const DIRECTION: [f32; 6] = [72.0, 46.0, 30.0, 10.0, -14.0, -36.0];
 /// Hairs' lengths along the line, metres.
 const LENGTH: [f32; 6] = [0.0062, 0.0086, 0.0092, 0.0088, 0.0076, 0.0056];
 /// Hairs a side.
-const NUM_HAIRS: usize = 300;
+const NUM_HAIRS: usize = 340;
 /// Half the width of a hair at its root, metres; somewhat more than a real one's, a pixel must show it.
-const HALF_WIDTH: f32 = 0.000_13;
+const HALF_WIDTH: f32 = 0.000_10;
 /// Height of a hair's points over the skin, root to tip, metres.
 const LIFT: [f32; 4] = [-0.000_1, 0.000_45, 0.000_65, 0.000_35];
 
 /// Point of the left brow's middle line, seen from the front; `t` 0 to 1 from the nose outwards.
-fn line(t: f32) -> Vec2 {
+pub fn line(t: f32) -> Vec2 {
     Vec2::new(along(&LINE.map(|p| p.x), t), along(&LINE.map(|p| p.y), t))
+}
+
+/// Half the brow's height there, metres.
+pub fn half_height(t: f32) -> f32 {
+    along(&HALF_HEIGHT, t)
 }
 
 /// Both brows.

@@ -12,6 +12,8 @@ mod hairs;
 mod noise;
 mod occlusion;
 mod pores;
+#[cfg(test)]
+mod sample;
 mod skin;
 mod slopes;
 mod teeth;
@@ -35,7 +37,7 @@ pub fn paint(bust: &Bust) -> Result<Painted> {
     let features = Features::new(&chart, bust);
     let coarse = Atlas::new(bust, COARSE);
     let openness = Openness::new(bust, &coarse);
-    let wrinkles = bust.poses.iter().map(|pose| wrinkles::paint(&chart, &coarse, pose.name)).collect::<Result<_>>()?;
+    let wrinkles = bust.poses.iter().map(|pose| wrinkles::paint(&chart, &coarse, pose)).collect::<Result<_>>()?;
     let skin_surface = occlusion::paint(&coarse, &features, &openness)?;
 
     let fine = Atlas::new(bust, FINE);

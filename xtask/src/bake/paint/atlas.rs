@@ -28,6 +28,7 @@ pub struct Texel {
     /// Unit bitangent, where green points: along -v, up in the picture.
     pub bitangent: Vec3,
     corners: [Region; 3],
+    vertices: [usize; 3],
     weights: [f32; 3],
 }
 
@@ -75,6 +76,7 @@ impl<'a> Atlas<'a> {
             tangent,
             bitangent: normal.cross(tangent) * self.surface.tangents[corners[0]].w,
             corners: corners.map(|i| self.surface.regions[i]),
+            vertices: corners,
             weights,
         })
     }
@@ -93,6 +95,11 @@ impl<'a> Atlas<'a> {
     /// True on the islands and their skirts.
     pub fn is_covered(&self, x: usize, y: usize) -> bool {
         self.triangles[y * self.size + x] != NONE
+    }
+
+    /// A value given for each vertex, linear over the triangle a texel lies in.
+    pub fn between_vertices(&self, texel: &Texel, values: &[f32]) -> f32 {
+        (0..3).map(|k| values[texel.vertices[k]] * texel.weights[k]).sum()
     }
 
     /// Computes one value a covered texel, rows shared between two threads; `None` outside the islands.
@@ -190,7 +197,7 @@ pub fn fill_gaps<const N: usize>(size: usize, texels: &[Option<[f32; N]>]) -> Ve
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::plane;
+    use super::super::sample::plane;
     use super::*;
 
     #[test]

@@ -1,12 +1,13 @@
 //! Where the parts of a face are: soft masks by place on the skin, relative to the landmarks.
 
+use super::super::brows;
 use super::super::bust::{Bust, Eyeball, Region};
 use super::atlas::Texel;
 use super::chart::{Chart, Side, spline};
 use super::noise::{bell, fractal, lerp, noise, smoothstep};
 use glam::{Vec2, Vec3};
 
-/// Curves and centres the masks are measured from, unrolled millimetres unless 3D.
+/// Curves and centres the masks are measured from: unrolled millimetres, the brows' millimetres seen from the front.
 pub struct Features<'a> {
     /// The face they belong to.
     pub chart: &'a Chart,
@@ -71,10 +72,7 @@ impl<'a> Features<'a> {
             let points: Vec<Vec2> = indices.iter().chain(&indices[..1]).map(|&i| unrolled(i)).collect();
             spline(&points, 8)
         };
-        let brow = |side: Side| {
-            let marks = [(22, 0.5, 1.2), (23, 0.0, 2.2), (24, 0.0, 2.2), (25, 0.0, 1.8), (26, 1.5, 0.6)];
-            spline(&marks.map(|(index, x, y)| chart.at(side, index, (x, y))), 8)
-        };
+        let brow = |side: Side| (0..=32).map(|i| brows::line(i as f32 / 32.0) * 1000.0 * Vec2::new(side.sign(), 1.0)).collect();
         let brow_height = chart.middle(&[19, 20, 23, 24]).y;
         Self {
             chart,
@@ -125,14 +123,13 @@ impl<'a> Features<'a> {
         marks.chin = bell((place - self.chart.landmark(57).lerp(chin, 0.6)).length(), 17.0 * scale);
         marks.forehead = smoothstep(self.brow_height + 2.0, self.brow_height + 16.0, place.y) * smoothstep(75.0, 55.0, mirrored.x);
         marks.beard = self.beard(at, place) * (1.0 - marks.lip);
-        marks.brow = self.brow(at, side);
+        marks.brow = self.brow(place, side);
         marks
     }
 
-    /// Brow's own line at the place: nearest point's share of the way from the inner end, and which way up is.
-    pub fn along_brow(&self, at: Vec2, side: Side) -> (f32, Vec2) {
-        let curve = &self.brows[usize::from(side == Side::Right)];
-        let (_, share, direction) = nearest(curve, at);
+    /// Where along the brow a place is, 0 at the nose to 1, and the brow's direction there, seen from the front.
+    pub fn along_brow(&self, place: Vec3, side: Side) -> (f32, Vec2) {
+        let (_, share, direction) = nearest(&self.brows[usize::from(side == Side::Right)], place.truncate());
         (share, direction)
     }
 
@@ -162,9 +159,14 @@ impl<'a> Features<'a> {
         let level = lerp(inner.y, outer.y, across.clamp(0.0, 1.0));
         let is_upper = smoothstep(-1.0, 1.5, texel.place.y - level);
         marks.waterline = smoothstep(1.5, 0.5, above_ball) * within * ahead;
-        marks.lash_line = smoothstep(3.0, 1.6, above_ball) * smoothstep(0.2, 1.1, above_ball) * within * ahead * lerp(0.45, 1.0, is_upper);
+        marks.lash_line = smoothstep(3.0, 1.6, above_ball)
+            * smoothstep(0.2, 1.1, above_ball)
+            * within
+            * ahead
+            * lerp(0.45, 1.0, is_upper)
+            * (1.0 - marks.socket);
         marks.upper_lid = texel.share(Region::Eyelid) * is_upper;
-        marks.eye_corner = bell((texel.place - inner).length(), 3.6);
+        marks.eye_corner = bell((texel.place - inner).length(), 2.8);
     }
 
     fn hair(&self, place: Vec3, at: Vec2) -> f32 {
@@ -186,14 +188,16 @@ impl<'a> Features<'a> {
         jaw * smoothstep(line + 2.0, line - 7.0, at.y) * uneven.clamp(0.0, 1.0)
     }
 
-    fn brow(&self, at: Vec2, side: Side) -> f32 {
+    /// The band the brow's own hairs stand in, a little wider. Seen from the front, as they are.
+    fn brow(&self, place: Vec3, side: Side) -> f32 {
         let curve = &self.brows[usize::from(side == Side::Right)];
+        let at = place.truncate();
         if (at - curve[curve.len() / 2]).length() > 45.0 {
             return 0.0;
         }
         let (distance, share, _) = nearest(curve, at);
-        let half = lerp(4.1, 1.5, smoothstep(0.35, 1.0, share)) * lerp(0.85, 1.0, smoothstep(0.0, 0.2, share));
-        smoothstep(half + 1.2, half - 1.6, distance)
+        let half = brows::half_height(share) * 1000.0;
+        smoothstep(half + 1.4, half - 1.4, distance)
     }
 }
 
@@ -208,16 +212,37 @@ const HAIRLINE: [(f32, f32); 17] = [
     (74.0, 39.0),
     (83.0, 25.0),
     (90.0, 11.0),
-    (96.0, -1.0),
-    (102.0, -18.0),
-    (107.0, -36.0),
-    (118.0, -40.0),
-    (131.0, -14.0),
+    (95.0, -2.0),
+    (99.0, -18.0),
+    (101.0, -37.0),
+    (128.0, -43.0),
+    (135.0, -14.0),
     (142.0, -48.0),
     (165.0, -70.0),
     (205.0, -84.0),
     (252.0, -88.0),
 ];
+
+/// The smooth arch (least-squares parabola) through points that run from the middle outwards or the other way.
+pub fn arch(points: &[Vec2]) -> Vec<Vec2> {
+    let (first, last) = (points[0].x, points[points.len() - 1].x);
+    let share = |p: &Vec2| (p.x - first) / (last - first);
+    // Normal equations of y = a + b t + c t^2 by Cramer's rule; t in [0, 1] keeps them well conditioned.
+    let sum = |of: &dyn Fn(&Vec2) -> f32| points.iter().map(of).sum::<f32>();
+    let power = |n: i32| sum(&|p| share(p).powi(n));
+    let moment = |n: i32| sum(&|p| share(p).powi(n) * p.y);
+    let matrix = |columns: [[f32; 3]; 3]| glam::Mat3::from_cols_array_2d(&columns).determinant();
+    let columns = [[power(0), power(1), power(2)], [power(1), power(2), power(3)], [power(2), power(3), power(4)]];
+    let right = [moment(0), moment(1), moment(2)];
+    let all = matrix(columns);
+    let coefficient = |k: usize| {
+        let mut replaced = columns;
+        replaced[k] = right;
+        matrix(replaced) / all
+    };
+    let [a, b, c] = [0, 1, 2].map(coefficient);
+    (0..=32).map(|i| i as f32 / 32.0).map(|t| Vec2::new(lerp(first, last, t), a + (b + c * t) * t)).collect()
+}
 
 /// Distance to a curve, share of its length at the nearest point, unit direction there.
 fn nearest(curve: &[Vec2], at: Vec2) -> (f32, f32, Vec2) {
@@ -262,5 +287,13 @@ mod tests {
         assert!(contains(&square, Vec2::splat(0.5)) && !contains(&square, Vec2::new(1.5, 0.5)) && !contains(&square, Vec2::new(0.5, -0.5)));
         let (distance, share, _) = nearest(&square, Vec2::new(0.5, -0.5));
         assert_eq!((distance, share), (0.5, 0.125));
+    }
+
+    #[test]
+    fn an_arch_is_the_parabola_its_points_lie_on() {
+        let points: Vec<Vec2> = [3.0, 5.0, 6.0, 9.0, 11.0].iter().map(|&x: &f32| Vec2::new(x, 2.0 + x - 0.1 * x * x)).collect();
+        for p in arch(&points) {
+            assert!((p.y - (2.0 + p.x - 0.1 * p.x * p.x)).abs() < 1e-4, "{p}");
+        }
     }
 }

@@ -26,8 +26,8 @@ struct Kind {
     strength: f32,
 }
 
-const HEAD: Kind = Kind { density: 2.1, length: (2.2, 4.6), half_width: 0.085, strength: 0.72 };
-const BROW: Kind = Kind { density: 4.2, length: (3.0, 6.0), half_width: 0.10, strength: 0.62 };
+const HEAD: Kind = Kind { density: 3.2, length: (2.4, 5.0), half_width: 0.095, strength: 0.95 };
+const BROW: Kind = Kind { density: 3.4, length: (3.0, 6.0), half_width: 0.09, strength: 0.62 };
 const STUBBLE: Kind = Kind { density: 1.1, length: (0.3, 0.8), half_width: 0.075, strength: 0.25 };
 
 /// Draws all hairs.
@@ -131,8 +131,8 @@ fn head_flow(place: Vec3, normal: Vec3, whorl: Vec3) -> Vec3 {
 
 /// Upward at the inner end, then outward along the brow.
 fn brow_flow(features: &Features, place: Vec3, side: Side) -> Vec3 {
-    let (share, direction) = features.along_brow(features.chart.unroll(place), side);
-    let outward = Vec3::new(direction.x, direction.y, -0.4 * direction.x.abs());
+    let (share, direction) = features.along_brow(place, side);
+    let outward = Vec3::new(direction.x, direction.y, -0.5);
     let up = lerp(1.5, -0.12, smoothstep(0.0, 0.45, share));
     outward + Vec3::Y * up
 }

@@ -2,11 +2,15 @@
 
 use glam::Vec3;
 
+const PRIME_X: u32 = 0x8da6_b343;
+const PRIME_Y: u32 = 0xd816_3841;
+const PRIME_Z: u32 = 0xcb1a_b31f;
+const PRIME_SEED: u32 = 0x9e37_79b9;
+
 /// A hash of a lattice point, uniform over 32 bits.
 pub fn hash(x: i32, y: i32, z: i32, seed: u32) -> u32 {
-    let mut h = (x as u32).wrapping_mul(0x8da6_b343) ^ (y as u32).wrapping_mul(0xd816_3841) ^ (z as u32).wrapping_mul(0xcb1a_b31f);
-    h = h.wrapping_add(seed.wrapping_mul(0x9e37_79b9));
-    mix(h)
+    let h = (x as u32).wrapping_mul(PRIME_X) ^ (y as u32).wrapping_mul(PRIME_Y) ^ (z as u32).wrapping_mul(PRIME_Z);
+    mix(h.wrapping_add(seed.wrapping_mul(PRIME_SEED)))
 }
 
 /// Uniform in [0, 1).
@@ -41,21 +45,43 @@ impl Dice {
 }
 
 /// Smooth noise with features of about one unit, in [-1, 1] with mean 0 (gradient noise, quintic fade).
+#[inline]
 pub fn noise(p: Vec3, seed: u32) -> f32 {
-    let base = p.floor();
-    let f = p - base;
-    let (x, y, z) = (base.x as i32, base.y as i32, base.z as i32);
-    let corner = |dx: i32, dy: i32, dz: i32| {
-        let h = hash(x + dx, y + dy, z + dz, seed);
-        let away = f - Vec3::new(dx as f32, dy as f32, dz as f32);
-        // Ten bits a component: directions need not be evenly spread, only without a preferred axis.
-        let gradient = |shift: u32| ((h >> shift) & 1023) as f32 * (2.0 / 1023.0) - 1.0;
-        gradient(0) * away.x + gradient(10) * away.y + gradient(20) * away.z
-    };
-    let fade = f * f * f * (f * (f * 6.0 - Vec3::splat(15.0)) + Vec3::splat(10.0));
-    let along_x = |dy: i32, dz: i32| lerp(corner(0, dy, dz), corner(1, dy, dz), fade.x);
-    let along_y = |dz: i32| lerp(along_x(0, dz), along_x(1, dz), fade.y);
-    1.3 * lerp(along_y(0), along_y(1), fade.z)
+    let (x, y, z) = (floor(p.x), floor(p.y), floor(p.z));
+    let (fx, fy, fz) = (p.x - x as f32, p.y - y as f32, p.z - z as f32);
+    let hx = (x as u32).wrapping_mul(PRIME_X);
+    let hy = (y as u32).wrapping_mul(PRIME_Y);
+    let hz = (z as u32).wrapping_mul(PRIME_Z);
+    let (hx, hy, hz) = ([hx, hx.wrapping_add(PRIME_X)], [hy, hy.wrapping_add(PRIME_Y)], [hz, hz.wrapping_add(PRIME_Z)]);
+    let salt = seed.wrapping_mul(PRIME_SEED);
+    let (ux, uy, uz) = (quintic(fx), quintic(fy), quintic(fz));
+    let mut planes = [0.0; 2];
+    for (k, plane) in planes.iter_mut().enumerate() {
+        let mut rows = [0.0; 2];
+        for (j, row) in rows.iter_mut().enumerate() {
+            let mut corners = [0.0; 2];
+            for (i, corner) in corners.iter_mut().enumerate() {
+                let h = mix((hx[i] ^ hy[j] ^ hz[k]).wrapping_add(salt));
+                // Ten bits a component: directions need not be evenly spread, only without a preferred axis.
+                let gradient = |shift: u32| ((h >> shift) & 1023) as f32 * (2.0 / 1023.0) - 1.0;
+                *corner = gradient(0) * (fx - i as f32) + gradient(10) * (fy - j as f32) + gradient(20) * (fz - k as f32);
+            }
+            *row = lerp(corners[0], corners[1], ux);
+        }
+        *plane = lerp(rows[0], rows[1], uy);
+    }
+    1.3 * lerp(planes[0], planes[1], uz)
+}
+
+fn quintic(f: f32) -> f32 {
+    f * f * f * (f * (f * 6.0 - 15.0) + 10.0)
+}
+
+/// Largest integer not above `x`; `f32::floor` is a call where the processor's baseline lacks the instruction.
+#[inline]
+fn floor(x: f32) -> i32 {
+    let towards_zero = x as i32;
+    towards_zero - i32::from((towards_zero as f32) > x)
 }
 
 /// Sum of `octaves` of [`noise`], each twice as fine and half as strong.
@@ -80,19 +106,20 @@ pub struct Cell {
 }
 
 /// Cellular noise (Worley 1996).
+#[inline]
 pub fn cells(p: Vec3, seed: u32) -> Cell {
-    let base = p.floor();
-    let f = p - base;
-    let (x, y, z) = (base.x as i32, base.y as i32, base.z as i32);
+    let (x, y, z) = (floor(p.x), floor(p.y), floor(p.z));
+    let (fx, fy, fz) = (p.x - x as f32, p.y - y as f32, p.z - z as f32);
+    let salt = seed.wrapping_mul(PRIME_SEED);
     let (mut first, mut second, mut id) = (f32::MAX, f32::MAX, 0);
     for dz in -1..=1 {
+        let hz = ((z + dz) as u32).wrapping_mul(PRIME_Z);
         for dy in -1..=1 {
+            let hyz = hz ^ ((y + dy) as u32).wrapping_mul(PRIME_Y);
             for dx in -1..=1 {
-                let h = hash(x + dx, y + dy, z + dz, seed);
+                let h = mix((hyz ^ ((x + dx) as u32).wrapping_mul(PRIME_X)).wrapping_add(salt));
                 let jitter = |shift: u32| ((h >> shift) & 1023) as f32 * (1.0 / 1023.0);
-                let ax = dx as f32 + jitter(0) - f.x;
-                let ay = dy as f32 + jitter(10) - f.y;
-                let az = dz as f32 + jitter(20) - f.z;
+                let (ax, ay, az) = (dx as f32 + jitter(0) - fx, dy as f32 + jitter(10) - fy, dz as f32 + jitter(20) - fz);
                 let distance = ax * ax + ay * ay + az * az;
                 if distance < first {
                     second = first;
@@ -108,12 +135,14 @@ pub fn cells(p: Vec3, seed: u32) -> Cell {
 }
 
 /// 0 below `low`, 1 above `high`, smooth between; falls where `low > high`.
+#[inline]
 pub fn smoothstep(low: f32, high: f32, x: f32) -> f32 {
     let t = ((x - low) / (high - low)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 
 /// `a` at 0, `b` at 1.
+#[inline]
 pub fn lerp(a: f32, b: f32, t: f32) -> f32 {
     a + (b - a) * t
 }
@@ -124,6 +153,7 @@ pub fn bell(x: f32, width: f32) -> f32 {
     libm::expf(-t * t)
 }
 
+#[inline]
 fn mix(mut h: u32) -> u32 {
     h ^= h >> 16;
     h = h.wrapping_mul(0x7feb_352d);

@@ -9,9 +9,9 @@ use anyhow::Result;
 use glam::{Vec2, Vec3};
 
 /// Directions light comes from, evenly spread over the sphere.
-const NUM_DIRECTIONS: usize = 96;
+const NUM_DIRECTIONS: usize = 72;
 /// Pixels a side of the depth picture seen from each of them.
-const DEPTH_SIZE: usize = 640;
+const DEPTH_SIZE: usize = 576;
 /// What lies less than this behind the nearest surface is lit, mm.
 const BIAS: f32 = 1.6;
 
@@ -55,7 +55,9 @@ pub fn paint(atlas: &Atlas, features: &Features, openness: &Openness) -> Result<
     let size = atlas.size();
     let texels = atlas.map(|texel| {
         // A gamma below 1: what is shut off from the sky still gets light from the skin around it.
-        [libm::powf(openness.at(texel.uv), 0.75), roughness(texel, &features.marks(texel))]
+        let marks = features.marks(texel);
+        // Short hair lies in its own shadow.
+        [libm::powf(openness.at(texel.uv), 0.75) * (1.0 - 0.25 * marks.hair), roughness(texel, &marks)]
     });
     let code = |x: f32| (x.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
     let rgb: Vec<u8> = fill_gaps(size, &texels).iter().flat_map(|t| [code(t[0]), code(t[1]), 0]).collect();
@@ -66,12 +68,12 @@ pub fn paint(atlas: &Atlas, features: &Features, openness: &Openness) -> Result<
 fn roughness(texel: &Texel, marks: &Marks) -> f32 {
     let uneven = 0.035 * fractal(texel.place / 6.0, 3, 301) + 0.02 * fractal(texel.place / 1.4, 2, 302);
     let oily = marks.nose.max(0.65 * marks.forehead).max(0.4 * marks.chin);
-    let mut roughness = lerp(0.52, 0.40, oily) + uneven;
-    roughness = lerp(roughness, 0.46, marks.upper_lid * 0.6);
-    roughness = lerp(roughness, 0.36 + uneven, marks.lip);
+    let mut roughness = lerp(0.60, 0.47, oily) + uneven;
+    roughness = lerp(roughness, 0.52, marks.upper_lid * 0.6);
+    roughness = lerp(roughness, 0.40 + uneven, marks.lip);
     roughness = lerp(roughness, 0.22, marks.waterline.max(0.8 * marks.eye_corner).max(0.6 * marks.lip * marks.lip_gap));
     roughness = lerp(roughness, 0.25, marks.mouth.max(marks.socket));
-    lerp(roughness, 0.66, marks.hair.max(0.6 * marks.brow))
+    lerp(roughness, 0.88, marks.hair.max(0.6 * marks.brow))
 }
 
 /// Nearest distances seen along one direction.

@@ -11,7 +11,7 @@ use anyhow::Result;
 use glam::Vec3;
 
 /// Height of a hair over the skin as the map shows it, mm.
-const HAIR_HEIGHT: f32 = 0.045;
+const HAIR_HEIGHT: f32 = 0.03;
 
 /// What the pattern is like at one place.
 struct Grain {
@@ -32,15 +32,17 @@ struct Grain {
 /// Paints the base slope map.
 pub fn paint(atlas: &Atlas, features: &Features, hairs: &Hairs, lines: &Furrows) -> Result<SlopeMap> {
     let size = atlas.size();
-    let mut slopes = slopes::of_relief(atlas, 0.06, |texel| {
+    let mut heights = atlas.map(|texel| {
         let marks = features.marks(texel);
-        let grain = grain(features, texel, &marks);
-        let (normal, outside) = (texel.normal, 1.0 - marks.mouth.max(marks.socket));
-        Some(move |p: Vec3| outside * grain.height(p) + lines.height(p, normal))
+        let outside = 1.0 - marks.mouth.max(marks.socket);
+        outside * grain(features, texel, &marks).height(texel.place) + lines.height(texel.place, texel.normal)
     });
-    add_hairs(atlas, hairs, &mut slopes);
+    for (height, cover) in heights.iter_mut().zip(&hairs.cover) {
+        *height = height.map(|h| h + HAIR_HEIGHT * cover);
+    }
+    let slopes = slopes::of_heights(atlas, &heights);
     let scale = slopes::scale_for(&slopes, 1e-3);
-    let image = encode::jpeg(size, &slopes::encode_map(size, &slopes, scale, false), 85)?;
+    let image = encode::jpeg(size, &slopes::encode_map(size, &slopes, scale, false), 78)?;
     Ok(SlopeMap { image, scale })
 }
 
@@ -54,12 +56,12 @@ fn grain(features: &Features, texel: &Texel, marks: &Marks) -> Grain {
     let pull = Vec3::new(0.5 * beside.x.signum(), -1.0, -0.3).lerp(Vec3::X, marks.neck).normalize();
     let pull = (pull - texel.normal * texel.normal.dot(pull)).normalize_or(texel.tangent);
     Grain {
-        period: lerp(lerp(0.80, 1.05, coarse), 0.60, delicate),
-        pore: bare * lerp(lerp(0.016, 0.052, coarse), 0.005, delicate) * (1.0 - 0.7 * marks.hair) * (1.0 - 0.6 * marks.ear),
-        crease: bare * lerp(0.020, 0.024, delicate) * (1.0 - 0.5 * marks.ear),
+        period: lerp(lerp(0.95, 1.25, coarse), 0.75, delicate),
+        pore: bare * lerp(lerp(0.030, 0.085, coarse), 0.008, delicate) * (1.0 - 0.7 * marks.hair) * (1.0 - 0.6 * marks.ear),
+        crease: bare * lerp(0.028, 0.030, delicate) * (1.0 - 0.5 * marks.ear),
         pull: pull * lerp(0.30, 0.12, coarse),
         fold: 0.07 * marks.lip,
-        lumps: bare * lerp(0.030, 0.055, marks.chin.max(marks.neck * 0.6)),
+        lumps: bare * lerp(0.045, 0.075, marks.chin.max(marks.neck * 0.6)),
     }
 }
 
@@ -67,11 +69,11 @@ impl Grain {
     fn height(&self, p: Vec3) -> f32 {
         let stretched = p - self.pull * p.dot(self.pull) / self.pull.length();
         let pores = cells(stretched / self.period, 201);
-        let radius = lerp(0.16, 0.34, (pores.id & 255) as f32 / 255.0);
-        let pit = smoothstep(radius * 1.5, 0.0, pores.first) * lerp(0.35, 1.0, ((pores.id >> 8) & 255) as f32 / 255.0);
+        let radius = lerp(0.20, 0.40, (pores.id & 255) as f32 / 255.0);
+        let pit = smoothstep(radius * 1.5, 0.0, pores.first) * smoothstep(0.1, 1.0, ((pores.id >> 8) & 255) as f32 / 255.0);
         let warp = Vec3::new(noise(p / 1.7, 202), noise(p / 1.7, 203), noise(p / 1.7, 204)) * 0.35;
         let net = cells((stretched + warp) / (self.period * 0.78), 205);
-        let crease = smoothstep(0.16, 0.0, net.second - net.first);
+        let crease = smoothstep(0.22, 0.0, net.second - net.first);
         let mut height = -self.pore * pit - self.crease * crease + self.lumps * fractal(p / 2.6, 2, 206);
         if self.fold > 0.0 {
             let fold = noise(Vec3::new((p.x + 0.7 * noise(p / 2.6, 207)) / 0.95, p.y / 8.0, 0.5), 208);
@@ -79,31 +81,5 @@ impl Grain {
             height -= self.fold * (smoothstep(0.0, 0.6, fold) + 0.4 * fine);
         }
         height
-    }
-}
-
-/// Adds the relief of the drawn hairs, by differences between neighbouring texels.
-fn add_hairs(atlas: &Atlas, hairs: &Hairs, slopes: &mut [Option<[f32; 2]>]) {
-    let size = atlas.size();
-    for y in 1..size - 1 {
-        for x in 1..size - 1 {
-            let index = y * size + x;
-            let around = [index - 1, index + 1, index - size, index + size];
-            if around.iter().all(|&i| hairs.cover[i] == 0.0) {
-                continue;
-            }
-            let (Some(slope), Some((texel, [sx, sy]))) = (&mut slopes[index], atlas.texel_with_steps(x, y)) else { continue };
-            let dx = (hairs.cover[index + 1] - hairs.cover[index - 1]) * 0.5 * HAIR_HEIGHT;
-            let dy = (hairs.cover[index + size] - hairs.cover[index - size]) * 0.5 * HAIR_HEIGHT;
-            let (xx, xy, yy) = (sx.dot(sx), sx.dot(sy), sy.dot(sy));
-            let determinant = xx * yy - xy * xy;
-            if determinant <= 1e-9 {
-                continue;
-            }
-            // Gradient in space from the differences along two oblique steps (dual basis).
-            let gradient = sx * ((dx * yy - dy * xy) / determinant) + sy * ((dy * xx - dx * xy) / determinant);
-            slope[0] -= gradient.dot(texel.tangent);
-            slope[1] -= gradient.dot(texel.bitangent);
-        }
     }
 }

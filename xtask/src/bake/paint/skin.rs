@@ -10,15 +10,15 @@ use anyhow::Result;
 use glam::{Vec2, Vec3};
 
 /// Skin with the pigments of an ordinary cheekless place, sRGB. Tuned by eye.
-const BASE_SRGB: [u8; 3] = [205, 160, 136];
+const BASE_SRGB: [u8; 3] = [207, 161, 139];
 /// Optical density one unit of each pigment adds to red, green and blue (directions of Tsumura's separation of skin
 /// images into melanin and haemoglobin, 1999, as public implementations have them).
 const MELANIN: Vec3 = Vec3::new(0.4143, 0.3570, 0.8372);
 const HAEMOGLOBIN: Vec3 = Vec3::new(0.2988, 0.6838, 0.6657);
 /// Colours of what is not skin, sRGB. Tuned by eye.
-const HAIR_SRGB: [u8; 3] = [44, 31, 24];
-const STUBBLE_SRGB: [u8; 3] = [84, 72, 66];
-const LIP_SRGB: [u8; 3] = [176, 98, 90];
+const HAIR_SRGB: [u8; 3] = [40, 30, 25];
+const STUBBLE_SRGB: [u8; 3] = [80, 72, 72];
+const LIP_SRGB: [u8; 3] = [172, 106, 95];
 const MOUTH_SRGB: [u8; 3] = [112, 46, 44];
 const WATERLINE_SRGB: [u8; 3] = [214, 150, 138];
 const NOSTRIL_SRGB: [u8; 3] = [74, 34, 27];
@@ -48,7 +48,7 @@ pub fn paint(atlas: &Atlas, features: &Features, hairs: &Hairs, openness: impl F
             mixed.to_array().map(encode::srgb)
         })
         .collect::<Vec<u8>>();
-    encode::jpeg(size, &bytes, 88)
+    encode::jpeg(size, &bytes, 90)
 }
 
 fn color(features: &Features, texel: &Texel, marks: &Marks, moles: &[(Vec3, f32, f32)], openness: f32) -> Vec3 {
@@ -58,18 +58,18 @@ fn color(features: &Features, texel: &Texel, marks: &Marks, moles: &[(Vec3, f32,
     let mut color = rgb(BASE_SRGB) * Vec3::from_array(density.to_array().map(|d| libm::expf(-d)));
 
     // Shadow of hair and beard roots under the skin: darker and less red.
-    let roots = (0.55 * marks.hair).max(0.34 * marks.brow);
+    let roots = (0.66 * marks.hair).max(0.42 * marks.brow);
     color = color.lerp(rgb(HAIR_SRGB) * 1.5, roots);
     color = color.lerp(color * rgb(STUBBLE_SRGB) * 2.6, 0.30 * marks.beard);
 
     let lip = lip_color(features, p, marks);
     color = color.lerp(lip, marks.lip);
-    color = color.lerp(rgb(MOUTH_SRGB) * 0.8, marks.lip_gap * marks.lip * 0.75);
+    color = color.lerp(rgb(MOUTH_SRGB) * 0.8, marks.lip_gap * marks.lip * 0.6);
     color = color.lerp(color * Vec3::new(1.06, 1.05, 1.05), 0.6 * marks.lip_rim * (1.0 - marks.lip));
 
     color = color.lerp(rgb(HAIR_SRGB) * 0.75, 0.72 * marks.lash_line);
     color = color.lerp(rgb(WATERLINE_SRGB), 0.85 * marks.waterline * (1.0 - 0.6 * marks.lash_line));
-    color = color.lerp(rgb([206, 120, 112]), 0.55 * marks.eye_corner);
+    color = color.lerp(rgb([206, 124, 114]), 0.42 * marks.eye_corner);
 
     // Where hardly any light comes in, skin is lit through itself: deep red-brown, not grey.
     let nose = features.chart.middle(&[31, 33, 35]);
@@ -84,30 +84,33 @@ fn pigment(features: &Features, p: Vec3, marks: &Marks, moles: &[(Vec3, f32, f32
     let blotch = fractal(p / 19.0, 3, 1);
     let mottle = fractal(p / 5.5, 3, 2);
     let grain = fractal(p / 1.3, 2, 3);
-    let mut melanin = 0.045 * fractal(p / 33.0, 2, 4) + 0.035 * mottle + 0.020 * grain;
-    let mut blood = 0.060 * blotch + 0.055 * fractal(p / 3.6, 3, 5) + 0.025 * noise(p / 0.9, 6);
+    let mut melanin = 0.055 * fractal(p / 33.0, 2, 4) + 0.06 * mottle + 0.045 * grain;
+    let mut blood = 0.095 * blotch + 0.095 * fractal(p / 3.6, 3, 5) + 0.045 * noise(p / 0.9, 6);
     // Cheeks are mottled more than the rest: fine vessels.
     let flush = marks.cheek * (1.0 + 0.5 * fractal(p / 7.0, 3, 7));
-    blood += 0.20 * flush + 0.27 * marks.nose_tip * (1.0 + 0.25 * mottle) + 0.06 * marks.nose + 0.13 * marks.chin + 0.26 * marks.ear;
-    blood += 0.11 * marks.under_eye + 0.14 * marks.upper_lid + 0.05 * marks.brow;
-    melanin += 0.12 * marks.under_eye + 0.05 * marks.upper_lid + 0.055 * marks.forehead + 0.03 * marks.beard;
+    blood += 0.27 * flush + 0.34 * marks.nose_tip * (1.0 + 0.25 * mottle) + 0.06 * marks.nose + 0.13 * marks.chin + 0.26 * marks.ear;
+    blood += 0.17 * marks.under_eye + 0.18 * marks.upper_lid + 0.05 * marks.brow;
+    melanin += 0.04 * marks.under_eye + 0.03 * marks.upper_lid + 0.055 * marks.forehead + 0.03 * marks.beard;
+    let visible = features.chart.front(p) * (1.0 - marks.hair);
+    let freckles = if visible > 0.0 { freckles(p) } else { 0.0 };
+    let freckles = freckles * (0.35 + marks.cheek + 0.8 * marks.nose + 0.3 * marks.forehead).min(1.3) * visible;
     // Forehead, temples and neck are paler in blood; the neck is shaded by the chin and less tanned in front.
+    blood += 0.10 * freckles;
     blood -= 0.07 * marks.forehead + 0.05 * marks.neck;
     melanin += marks.neck * (0.03 + 0.04 * blotch);
-    let freckles = freckles(p) * (0.35 + marks.cheek + 0.8 * marks.nose + 0.3 * marks.forehead).min(1.3) * features.chart.front(p);
-    melanin += 0.22 * freckles * (1.0 - marks.hair);
+    melanin += 0.30 * freckles;
     for &(centre, radius, strength) in moles {
         let away = (p - centre).length();
         if away < 3.0 * radius {
             let edge = away + 0.25 * radius * noise(p / (radius * 0.8), 12);
             melanin += strength * smoothstep(1.15 * radius, 0.55 * radius, edge);
-            blood += 0.25 * strength * smoothstep(1.3 * radius, 0.6 * radius, edge);
+            blood += 0.95 * strength * smoothstep(1.3 * radius, 0.6 * radius, edge);
         }
     }
-    // Small red spots, rare.
-    let spot = cells(p / 8.5, 13);
-    if unit(spot.id) > 0.93 {
-        blood += 0.10 * bell(spot.first * 8.5, 1.1);
+    if visible > 0.0 {
+        // Small red spots, rare.
+        let spot = cells(p / 8.5, 13);
+        blood += if unit(spot.id) > 0.93 { 0.10 * bell(spot.first * 8.5, 1.1) } else { 0.0 };
     }
     Pigment { melanin, blood }
 }

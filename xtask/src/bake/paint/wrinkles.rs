@@ -1,9 +1,10 @@
 //! The wrinkles of the four reference poses, drawn along the lines their muscles fold the skin in. Lengths are
 //! millimetres on a face whose pupils are 60 mm apart; depths and places are tuned by eye on renders.
 
-use super::super::bust::SlopeMap;
+use super::super::bust::{PoseField, SlopeMap};
 use super::atlas::Atlas;
 use super::chart::{Chart, Side, spline};
+use super::features::arch;
 use super::furrow::{Furrows, Stroke};
 use super::noise::{Dice, cells, lerp, noise, smoothstep};
 use super::slopes;
@@ -46,13 +47,25 @@ impl Dimples {
     }
 }
 
-/// The wrinkle map of a pose.
-pub fn paint(chart: &Chart, atlas: &Atlas, pose: &str) -> Result<SlopeMap> {
-    slopes::wrinkle_map(atlas.size(), &slopes_of(chart, atlas, &relief(chart, pose)?))
+/// Influence below which furrows are no longer carved deeper to make up for it.
+const LEAST_INFLUENCE: f32 = 0.4;
+
+/// The wrinkle map of a pose. Where the pose's bones have only a part of the skinning weights, so that the map is shown at
+/// that part even at the pose itself, the furrows are that much deeper; where they have none, nothing is drawn.
+pub fn paint(chart: &Chart, atlas: &Atlas, pose: &PoseField) -> Result<SlopeMap> {
+    let mut slopes = slopes_of(atlas, &relief(chart, pose.name)?);
+    let gains = atlas.map(|texel| {
+        let influence = atlas.between_vertices(texel, &pose.influence);
+        smoothstep(0.0, 0.15, influence) / influence.clamp(LEAST_INFLUENCE, 1.0)
+    });
+    for (slope, gain) in slopes.iter_mut().zip(gains) {
+        *slope = slope.zip(gain).map(|(p, gain)| p.map(|v| v * gain));
+    }
+    slopes::wrinkle_map(atlas.size(), &slopes)
 }
 
 /// Slopes of a relief over the atlas.
-pub fn slopes_of(_chart: &Chart, atlas: &Atlas, relief: &Relief) -> Vec<Option<[f32; 2]>> {
+fn slopes_of(atlas: &Atlas, relief: &Relief) -> Vec<Option<[f32; 2]>> {
     slopes::of_relief(atlas, 0.1, |texel| {
         let normal = texel.normal;
         Some(move |place: Vec3| relief.height(place, normal))
@@ -130,24 +143,21 @@ fn stretch(pen: &mut Pen) {
     pen.seed = 100;
     // Height above the brows, from and to as shares of the way to the temples (negative: right), depth, width.
     const ROWS: [(f32, f32, f32, f32, f32); 9] = [
-        (10.0, 0.22, 0.95, 0.55, 0.75),
-        (11.0, -0.90, -0.26, 0.50, 0.70),
-        (17.5, -0.97, 0.98, 0.95, 0.95),
-        (25.5, -1.00, 0.62, 1.05, 1.00),
-        (26.5, 0.42, 1.00, 0.70, 0.85),
-        (34.0, -0.72, 0.96, 0.95, 0.95),
-        (33.0, -1.00, -0.58, 0.55, 0.75),
-        (42.0, -0.80, 0.74, 0.75, 0.90),
-        (49.5, -0.55, 0.66, 0.42, 0.80),
+        (8.5, 0.20, 0.95, 0.62, 0.75),
+        (9.5, -0.92, -0.26, 0.55, 0.70),
+        (14.5, -0.97, 0.98, 1.05, 0.95),
+        (21.0, -1.00, 0.60, 1.15, 1.00),
+        (22.0, 0.42, 1.00, 0.80, 0.85),
+        (28.5, -0.74, 0.96, 1.10, 0.95),
+        (27.5, -1.00, -0.60, 0.62, 0.75),
+        (36.0, -0.80, 0.76, 0.95, 0.90),
+        (43.5, -0.55, 0.66, 0.62, 0.80),
     ];
-    let brows: Vec<Vec2> = {
-        let half = |side: Side| [22, 23, 24, 25, 26].map(|index| pen.chart.at(side, index, (0.0, 0.0)));
-        half(Side::Right).into_iter().rev().chain(half(Side::Left)).collect()
-    };
+    let brow = |side: Side| arch(&[22, 23, 24, 25, 26].map(|index| pen.chart.at(side, index, (0.0, 0.0))));
+    let brows: Vec<Vec2> = brow(Side::Right).into_iter().rev().chain(brow(Side::Left)).collect();
     let mean = brows.iter().map(|p| p.y).sum::<f32>() / brows.len() as f32;
     let reach = pen.chart.at(Side::Left, 26, (1.0, 0.0)).x;
-    let curve = spline(&brows, 12);
-    let brow_height = |x: f32| curve.iter().min_by(|a, b| (a.x - x).abs().total_cmp(&(b.x - x).abs())).map_or(mean, |p| p.y);
+    let brow_height = |x: f32| brows.iter().min_by(|a, b| (a.x - x).abs().total_cmp(&(b.x - x).abs())).map_or(mean, |p| p.y);
     for (height, from, to, depth, width) in ROWS {
         let mut dice = pen.dice();
         let tilt = dice.signed() * 1.2;
@@ -159,7 +169,7 @@ fn stretch(pen: &mut Pen) {
                 let level = lerp(brow_height(x * reach), mean, flatter);
                 // A dip in the middle where the two halves of the muscle part, a drop towards the temples.
                 let dip = -2.6 * smoothstep(0.32, 0.0, x.abs()) - 5.5 * smoothstep(0.7, 1.05, x.abs());
-                let y = level + (height + dip + tilt * x + 0.8 * dice.signed()) * pen.chart.scale();
+                let y = level + (height + dip + tilt * x + 0.45 * dice.signed()) * pen.chart.scale();
                 Vec2::new(x * reach, y)
             })
             .collect();
@@ -168,7 +178,7 @@ fn stretch(pen: &mut Pen) {
             stroke.bulge = 0.55;
             stroke.lean = 0.25;
             stroke.broken = 0.5;
-            stroke.stray = 1.3;
+            stroke.stray = 0.9;
             stroke.taper = (0.22, 0.22);
             stroke.companions = 5;
         });
@@ -188,8 +198,8 @@ fn compress(pen: &mut Pen) {
     pen.line(Side::Right, &[(22, -8.4, -3.0), (22, -8.2, 3.0), (22, -7.4, 10.0)], 0.42, 0.65, frown);
     for side in Side::BOTH {
         // Skin gathered over the inner brow.
-        pen.line(side, &[(22, 2.5, 3.5), (22, 5.0, 8.0), (23, -3.0, 11.0)], 0.5, 0.8, frown);
-        pen.line(side, &[(23, -2.0, 5.0), (23, 1.0, 8.5), (23, 6.0, 11.0)], 0.32, 0.7, frown);
+        pen.line(side, &[(22, 2.5, 3.5), (22, 5.0, 8.0), (23, -3.0, 11.0)], 0.38, 0.8, |s| s.shoulder = 3.4);
+        pen.line(side, &[(23, -2.0, 5.0), (23, 1.0, 8.5), (23, 6.0, 11.0)], 0.24, 0.75, |s| s.shoulder = 3.0);
         // The brow pressed down over the lid.
         pen.line(side, &[(42, 0.0, 4.5), (42, 6.0, 7.0), (43, 2.0, 7.0), (44, 2.0, 6.5)], 0.42, 0.75, |s| s.lean = 0.4);
         // Bunny lines.
@@ -296,7 +306,7 @@ fn crows_feet(pen: &mut Pen, side: Side) {
             let (sin, cos) = libm::sincosf(angle + turn);
             (45, radius * cos, radius * sin - 0.5)
         };
-        let depth = lerp(0.42, 0.72, (1.0 - (share - 0.5).abs() * 2.0).max(0.0));
+        let depth = lerp(0.50, 0.85, (1.0 - (share - 0.5).abs() * 2.0).max(0.0));
         let marks = [point(near, 0.0), point(lerp(near, far, 0.5), bend * 0.35), point(far, bend)];
         pen.line(side, &marks, depth, 0.68, |s| {
             s.shoulder = 2.1;
@@ -319,7 +329,7 @@ fn pucker(pen: &mut Pen) -> Vec<Dimples> {
     let scale = chart.scale();
     for (border, up) in &lips {
         // On the skin: a fan of lines towards the mouth. On the red: finer and more of them.
-        for (count, inward, outward, depth, width) in [(13, 1.5, 9.0, 0.62, 0.62), (21, 3.6, 1.0, 0.42, 0.5)] {
+        for (count, inward, outward, depth, width) in [(13, 1.5, 9.0, 0.48, 0.66), (21, 3.6, 1.0, 0.30, 0.5)] {
             for i in 0..count {
                 let mut dice = pen.dice();
                 let share = (i as f32 + 0.5 + 0.35 * dice.signed()) / count as f32;
@@ -343,7 +353,7 @@ fn pucker(pen: &mut Pen) -> Vec<Dimples> {
             }
         }
     }
-    pen.line(Side::Left, &[(48, 6.0, -13.0), (57, -8.0, -9.0), (57, 0.0, -8.0), (57, 8.0, -9.0), (54, -6.0, -13.0)], 0.85, 1.2, |s| {
+    pen.line(Side::Left, &[(48, 6.0, -13.0), (57, -8.0, -9.0), (57, 0.0, -8.0), (57, 8.0, -9.0), (54, -6.0, -13.0)], 0.7, 1.3, |s| {
         s.shoulder = 4.0;
         s.broken = 0.1;
         s.companions = 3;
@@ -355,7 +365,7 @@ fn pucker(pen: &mut Pen) -> Vec<Dimples> {
     let chin = chart.unroll(chart.landmark(57).lerp(chart.landmark(8), 0.62));
     let Some((centre, _)) = chart.skin(chin) else { return Vec::new() };
     let patch = |period: f32, depth: f32, seed: u32| Dimples { centre, radius: Vec3::new(19.0, 14.0, 18.0) * scale, depth, period, seed };
-    vec![patch(5.2 * scale, 0.75, 771), patch(2.6 * scale, 0.30, 781)]
+    vec![patch(5.2 * scale, 0.62, 771), patch(2.8 * scale, 0.20, 781)]
 }
 
 /// Rings of the neck.
@@ -373,5 +383,64 @@ fn neck(pen: &mut Pen) {
             s.broken = 0.6;
             s.companions = 4;
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sample::head;
+    use super::*;
+
+    /// Share of a pose's slope energy where `inside` says so (place in mm).
+    fn energy_share(pose: &str, inside: impl Fn(Vec3) -> bool) -> f64 {
+        let bust = head();
+        let chart = Chart::new(&bust);
+        let atlas = Atlas::new(&bust, 256);
+        let slopes = slopes_of(&atlas, &relief(&chart, pose).expect("a known pose"));
+        let (mut within, mut all) = (0.0, 0.0);
+        for (i, slope) in slopes.iter().enumerate() {
+            let (Some(p), Some(texel)) = (slope, atlas.texel(i % 256, i / 256)) else { continue };
+            let energy = f64::from(p[0] * p[0] + p[1] * p[1]);
+            all += energy;
+            within += if inside(texel.place) { energy } else { 0.0 };
+        }
+        assert!(all > 1.0, "{pose} draws nothing");
+        within / all
+    }
+
+    #[test]
+    fn each_pose_folds_the_skin_over_its_muscles_and_nowhere_else() {
+        // The sample face: brows at y 34, eyes 20, nose -24, mouth -45, chin -86.
+        let shares = [
+            ("stretch", energy_share("stretch", |p| p.y > 34.0)),
+            ("compress", energy_share("compress", |p| p.y > -45.0 && p.y < 60.0 && p.x.abs() < 45.0)),
+            ("smile", energy_share("smile", |p| p.y < 30.0 && p.x.abs() > 12.0)),
+            ("pucker", energy_share("pucker", |p| p.y < -24.0 && p.x.abs() < 42.0)),
+        ];
+        for (pose, share) in shares {
+            assert!(share > 0.9, "{pose}: {share}");
+        }
+    }
+
+    #[test]
+    fn both_halves_are_folded_but_not_alike() {
+        for pose in ["stretch", "compress", "smile", "pucker"] {
+            let left = energy_share(pose, |p| p.x > 0.0);
+            assert!((0.35..0.65).contains(&left) && (left - 0.5).abs() > 1e-3, "{pose}: {left}");
+        }
+    }
+
+    #[test]
+    fn skin_without_furrows_is_exactly_flat() {
+        let bust = head();
+        let chart = Chart::new(&bust);
+        let relief = relief(&chart, "stretch").expect("a known pose");
+        assert_eq!(relief.height(Vec3::new(0.0, -86.0, 80.0), Vec3::Z), 0.0);
+    }
+
+    #[test]
+    fn a_pose_nobody_drew_is_an_error() {
+        let bust = head();
+        assert!(relief(&Chart::new(&bust), "surprise").is_err());
     }
 }
