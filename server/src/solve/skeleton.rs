@@ -34,7 +34,8 @@ impl Skeleton {
             if index >= self.bones.len() {
                 return Err(SolveError::BoneIndex { got: index, num_bones: self.bones.len() });
             }
-            if let Some(got) = point.to_array().into_iter().find(|value| !(value.abs() <= FARTHEST)) {
+            // A NaN is in no range.
+            if let Some(got) = point.to_array().into_iter().find(|value| !(-FARTHEST..=FARTHEST).contains(value)) {
                 return Err(SolveError::Value { field: "bones", index, got, expected: "within ±1 m of the origin of head space" });
             }
         }

@@ -128,7 +128,7 @@ impl SentHead {
         if norm.is_nan() || (norm - 1.0).abs() > 0.1 {
             return Err(SolveError::Value { field: "head.rotation", index: 0, got: norm as f32, expected: "of length 1" });
         }
-        match head.position.to_array().into_iter().enumerate().find(|(_, value)| !(value.abs() <= 100.0)) {
+        match head.position.to_array().into_iter().enumerate().find(|(_, value)| !(-100.0..=100.0).contains(value)) {
             Some((index, got)) => Err(SolveError::Value { field: "head.position", index, got, expected: "within ±100 m" }),
             None => Ok(()),
         }
