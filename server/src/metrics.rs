@@ -56,7 +56,10 @@ impl Metrics {
         registry.register_with_unit("solve", "Time to solve one frame", Unit::Seconds, metrics.solve_seconds.clone());
         registry.register("frames_dropped", "Frames that were refused, or that a slow viewer skipped, by reason", metrics.dropped.clone());
         registry.register("sessions_ended", "Sockets refused or ended by the server, by reason", metrics.refused.clone());
-        Self { registry, ..metrics }
+        let metrics = Self { registry, ..metrics };
+        // Listed from the start, with its zero.
+        metrics.drop_frames("slow_viewer", 0);
+        metrics
     }
 
     /// Counts frames that did not go on.

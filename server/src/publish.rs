@@ -4,7 +4,7 @@ use crate::config::seconds;
 use crate::pipeline::Pipeline;
 use crate::room::{Publishing, RoomError};
 use crate::service::{Hub, stopped};
-use crate::socket::{Ending, ErrorMessage, Socket, Stop, close, send, send_json};
+use crate::socket::{Ending, ErrorMessage, Socket, Stop, close, farewell, send, send_json};
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
 use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
@@ -71,7 +71,10 @@ pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName) {
             hub.metrics.end(ending.error.as_ref().map_or("shutdown", |error| error.code));
             close(socket, &ending).await;
         }
-        Stop::Gone(reason) => hub.metrics.end(reason),
+        Stop::Gone(reason) => {
+            hub.metrics.end(reason);
+            farewell(socket).await;
+        }
     }
 }
 
@@ -297,7 +300,8 @@ struct Rate {
 impl Rate {
     fn new(frames_per_second: u32, now: Instant) -> Self {
         let interval = Duration::from_secs(1) / frames_per_second;
-        Self { interval, burst: (interval * 2).max(Duration::from_millis(100)), due: now, has_told: false }
+        let burst = (interval * 2).max(Duration::from_millis(100));
+        Self { interval, burst, due: now.checked_sub(burst).unwrap_or(now), has_told: false }
     }
 
     /// Counts a frame; gives the time before which no other shall be read.
@@ -315,7 +319,7 @@ mod tests {
     #[test]
     fn a_fast_sender_is_slowed_to_the_rate_after_a_short_burst() {
         let start = Instant::now() + Duration::from_secs(10);
-        let mut rate = Rate::new(100, start - Duration::from_secs(5));
+        let mut rate = Rate::new(100, start);
         let mut now = start;
         for _ in 0..200 {
             now = rate.take(now).unwrap_or(now);

@@ -204,6 +204,7 @@ async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sen
                     let _ = ready.take().map(|ready| ready.send(()));
                 }
                 Ok(Answer::Calibrated { t }) => tracing::info!(t, "calibrated"),
+                Ok(Answer::Error { code, message }) if code == "too_fast" => tracing::info!(message),
                 Ok(Answer::Error { code, message }) => {
                     errors += 1;
                     progress.suspend(|| eprintln!("server: {message} ({code})"));

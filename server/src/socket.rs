@@ -184,7 +184,7 @@ pub(crate) async fn send_json(socket: &mut Socket, value: &impl Serialize, timeo
 /// Tells the peer why, closes, and waits a little for its answer: what is unread when a connection is cut would take the
 /// last message with it.
 pub(crate) async fn close(mut socket: Socket, ending: &Ending) {
-    let farewell = async {
+    let telling = async {
         if let Some(error) = &ending.error {
             let text = serde_json::to_string(error).expect("plain data can be written");
             socket.feed(Message::text(text)).await?;
@@ -199,9 +199,16 @@ pub(crate) async fn close(mut socket: Socket, ending: &Ending) {
             })
             .collect();
         socket.send(Message::Close(Some(CloseFrame { code: ending.code, reason: reason.into() }))).await?;
-        while socket.next().await.is_some_and(|message| message.is_ok()) {}
         Ok::<(), Error>(())
     };
-    // Whether the peer still listened is its own affair.
-    let _ = tokio::time::timeout(CLOSE_TIMEOUT, farewell).await;
+    if let Ok(Ok(())) = tokio::time::timeout(CLOSE_TIMEOUT, telling).await {
+        farewell(socket).await;
+    }
+}
+
+/// Reads to the end of a socket that one side has closed, which also sends the answer to a peer's close.
+pub(crate) async fn farewell(mut socket: Socket) {
+    let reading = async { while socket.next().await.is_some_and(|message| message.is_ok()) {} };
+    // A peer that stays silent is cut off.
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, reading).await;
 }

@@ -7,7 +7,7 @@
 use crate::config::seconds;
 use crate::room::{Latest, Viewing};
 use crate::service::{Hub, stopped};
-use crate::socket::{Ending, ErrorMessage, Socket, Stop, close, frame_bytes};
+use crate::socket::{Ending, ErrorMessage, Socket, Stop, close, farewell, frame_bytes};
 use futures_util::{SinkExt, StreamExt};
 use rhytid_shared::RoomName;
 use rhytid_shared::view::{ViewHello, ViewMessage};
@@ -59,7 +59,10 @@ pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing
             hub.metrics.end(ending.error.as_ref().map_or("shutdown", |error| error.code));
             close(socket, &ending).await;
         }
-        Stop::Gone(reason) => hub.metrics.end(reason),
+        Stop::Gone(reason) => {
+            hub.metrics.end(reason);
+            farewell(socket).await;
+        }
     }
 }
 

@@ -1,0 +1,200 @@
+//! Facts about the program itself: its first line, its end, its errors, its memory.
+
+use std::io::{BufRead, BufReader, Read};
+use std::net::TcpStream;
+use std::path::PathBuf;
+use std::process::{Child, ChildStdout, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_rhytid-server");
+
+/// A server process that ends with the test.
+struct Served {
+    child: Child,
+    address: String,
+    stdout: BufReader<ChildStdout>,
+}
+
+impl Served {
+    fn start(args: &[&str]) -> Self {
+        let mut child = Command::new(PROGRAM)
+            .args(["serve", "--listen", "127.0.0.1:0"])
+            .args(args)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("the program starts");
+        let mut stdout = BufReader::new(child.stdout.take().expect("piped"));
+        let mut line = String::new();
+        stdout.read_line(&mut line).expect("it prints a line");
+        let address = line.trim().strip_prefix("listening on http://").expect("its first line says where it listens").to_owned();
+        Self { child, address, stdout }
+    }
+
+    fn view(&self, room: &str) -> WebSocket<TcpStream> {
+        let stream = TcpStream::connect(&self.address).expect("it listens");
+        stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+        tungstenite::client(format!("ws://{}/v1/rooms/{room}/view", self.address), stream).expect("it upgrades").0
+    }
+
+    #[cfg(unix)]
+    fn signal(&self, signal: rustix::process::Signal) {
+        let pid = rustix::process::Pid::from_raw(self.child.id() as i32).expect("not 0");
+        rustix::process::kill_process(pid, signal).expect("it still runs");
+    }
+
+    #[cfg(target_os = "linux")]
+    fn resident_kib(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("it still runs");
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).expect("Linux says so");
+        line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number of KiB")
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn run(args: &[&str]) -> Output {
+    Command::new(PROGRAM).args(args).output().expect("the program starts")
+}
+
+/// Runs a command that must fail with one line on standard error.
+fn failure(args: &[&str]) -> String {
+    let output = run(args);
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success(), "{args:?} must fail");
+    assert_eq!(stderr.trim_end().lines().count(), 1, "one line, not {stderr:?}");
+    assert!(stderr.starts_with("error: "), "{stderr}");
+    stderr
+}
+
+fn scratch(name: &str, content: &[u8]) -> PathBuf {
+    let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(name);
+    std::fs::write(&path, content).unwrap();
+    path
+}
+
+#[cfg(unix)]
+#[test]
+fn both_signals_end_it_cleanly_and_sockets_are_told() {
+    use rustix::process::Signal;
+    for signal in [Signal::INT, Signal::TERM] {
+        let mut served = Served::start(&[]);
+        let mut viewer = served.view("demo");
+        assert!(matches!(viewer.read(), Ok(Message::Ping(_))));
+        assert!(matches!(viewer.read(), Ok(Message::Text(_))));
+        served.signal(signal);
+        let close = loop {
+            match viewer.read().expect("a close frame comes") {
+                Message::Close(frame) => break frame.expect("with a reason"),
+                _ => continue,
+            }
+        };
+        assert_eq!((close.code, close.reason.as_str()), (CloseCode::Away, "server is shutting down"));
+        // Answers the close.
+        while viewer.read().is_ok() {}
+        assert_eq!(served.child.wait().unwrap().code(), Some(0), "{signal:?}");
+        let mut rest = String::new();
+        served.stdout.read_to_string(&mut rest).unwrap();
+        assert_eq!(rest, "", "standard output has one line");
+    }
+}
+
+#[test]
+fn what_cannot_work_says_so_in_one_line() {
+    let served = Served::start(&[]);
+    let error = failure(&["serve", "--listen", &served.address]);
+    assert!(error.contains(&served.address) && error.contains("in use"), "{error}");
+    assert!(failure(&["serve", "--character", "no/such.glb"]).contains("no/such.glb"));
+    let broken = scratch("broken.glb", b"glTF\x02\0\0\0\x0c\0\0");
+    let error = failure(&["serve", "--character", broken.to_str().unwrap()]);
+    assert!(error.contains("broken.glb") && error.contains("not a readable .glb"), "{error}");
+    let config = scratch("bad.toml", b"[limits]\nroms = 1\n");
+    let output = run(&["serve", "--config", config.to_str().unwrap()]);
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && stderr.contains("unknown field `roms`"), "{stderr}");
+    assert!(failure(&["serve", "--max-rooms", "0"]).contains("limits.rooms is 0"));
+    assert!(failure(&["send", "no/such.jsonl"]).contains("no/such.jsonl"));
+    let feed = scratch(
+        "bad.jsonl",
+        b"{\"type\":\"hello\",\"version\":1}\n\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n",
+    );
+    let to = format!("ws://{}", served.address);
+    let error = failure(&["send", feed.to_str().unwrap(), "--to", &to]);
+    assert!(error.contains("bad.jsonl, line 4: field t is 0, expected more than the 0"), "{error}");
+    let feed = scratch("good.jsonl", b"{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n");
+    let error = failure(&["send", feed.to_str().unwrap(), "--to", &to, "--room", "a.b"]);
+    assert!(error.contains("room name \"a.b\""), "{error}");
+    let error = failure(&["send", feed.to_str().unwrap(), "--to", "ws://127.0.0.1:1"]);
+    assert!(error.contains("cannot connect to ws://127.0.0.1:1/"), "{error}");
+    assert!(failure(&["send", "--clip", "walk", "--to", &to]).contains("no clip called \"walk\""));
+}
+
+#[test]
+fn flags_win_over_the_file_and_send_reports() {
+    let config = scratch("good.toml", b"listen = \"256.1.1.1:1\"\n[limits]\nrooms = 1\nviewers_per_room = 2\n");
+    let served = Served::start(&["--config", config.to_str().unwrap(), "--max-viewers", "1"]);
+    let _first = served.view("demo");
+    let mut second = served.view("demo");
+    let refused = second.read().unwrap();
+    assert!(refused.to_text().unwrap().contains("the room has 1 viewers already"), "{refused}");
+    let feed = scratch("three.jsonl", b"{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n{\"type\":\"frame\",\"t\":9,\"weights\":{}}\n{\"type\":\"calibrate\"}\n");
+    let output = run(&["send", feed.to_str().unwrap(), "--to", &format!("ws://{}", served.address), "--speed", "max"]);
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && stderr.contains("sent 2 frames, 0 refused"), "{stderr}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_viewer_takes_less_than_16_kib() {
+    use rustix::process::{Resource, getrlimit, setrlimit};
+    let mut limit = getrlimit(Resource::Nofile);
+    limit.current = limit.maximum;
+    setrlimit(Resource::Nofile, limit).unwrap();
+    let most = limit.maximum.map_or(2000, |maximum| (maximum.saturating_sub(200)).min(2000)) as usize;
+
+    let served = Served::start(&[]);
+    let connect = |count: usize| -> Vec<WebSocket<TcpStream>> {
+        (0..count)
+            .map(|_| {
+                let mut viewer = served.view("demo");
+                while !matches!(viewer.read().unwrap(), Message::Text(_)) {}
+                viewer.flush().unwrap();
+                viewer
+            })
+            .collect()
+    };
+    // The first ones pay for what all share.
+    let _first = connect(20);
+    let before = served.resident_kib();
+    let mut viewers = connect(most);
+    // A few frames, so that every buffer has been used.
+    let stream = TcpStream::connect(&served.address).unwrap();
+    let (mut publisher, _) = tungstenite::client(format!("ws://{}/v1/rooms/demo/publish", served.address), stream).unwrap();
+    publisher.send(Message::text(r#"{"type":"hello","version":1}"#)).unwrap();
+    publisher.read().unwrap();
+    let start = Instant::now();
+    for i in 0..20 {
+        publisher
+            .send(Message::text(format!(
+                r#"{{"type":"frame","t":{},"weights":{{"jawOpen":{}}}}}"#,
+                f64::from(i) * 0.04,
+                f64::from(i) * 0.05
+            )))
+            .unwrap();
+        std::thread::sleep((start + Duration::from_millis(40) * i as u32).saturating_duration_since(Instant::now()));
+    }
+    for viewer in &mut viewers {
+        while !matches!(viewer.read().unwrap(), Message::Binary(_)) {}
+    }
+    let bytes = (served.resident_kib() - before) as f64 * 1024.0 / most as f64;
+    println!("{most} viewers: {bytes:.0} bytes of memory each");
+    assert!(bytes <= 16.0 * 1024.0, "{bytes} bytes a viewer");
+}

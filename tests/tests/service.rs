@@ -1,0 +1,9 @@
+//! The service over real sockets: a server in this process, blocking clients in threads.
+
+mod service {
+    pub mod bad_input;
+    pub mod harness;
+    pub mod http;
+    pub mod rooms;
+    pub mod sending;
+}

@@ -1,0 +1,292 @@
+//! Publishers, viewers and what lies between them.
+
+use super::harness::Server;
+use rhytid_server::pipeline::Pipeline;
+use rhytid_server::{load_character, solve::SolveConfig};
+use rhytid_shared::{PublishMessage, PublishReader, TrackingFrame};
+use std::time::{Duration, Instant};
+use tungstenite::Message;
+use tungstenite::protocol::frame::coding::CloseCode;
+
+/// Calls `act` with 0, 1, …, one each `interval`.
+fn paced(count: u32, interval: Duration, mut act: impl FnMut(u32)) {
+    let start = Instant::now();
+    for i in 0..count {
+        std::thread::sleep((start + interval * i).saturating_duration_since(Instant::now()));
+        act(i);
+    }
+}
+
+#[test]
+fn fifty_viewers_see_one_face_and_nobody_hurts_another() {
+    const FRAMES: u32 = 150;
+    const LAST_T: u64 = 149 * 40_000;
+    let server = Server::start();
+    let readers: Vec<_> = (0..47)
+        .map(|_| {
+            let mut viewer = server.viewer("demo");
+            std::thread::spawn(move || {
+                let mut num_frames = 0;
+                let mut last = None;
+                while viewer.frame.captured_at_micros < LAST_T && viewer.next_packet() {
+                    assert!(last.is_none_or(|last| viewer.frame.seq > last), "frames come in their order");
+                    last = Some(viewer.frame.seq);
+                    num_frames += 1;
+                }
+                (num_frames, viewer.frame.seq, viewer.frame.points.clone())
+            })
+        })
+        .collect();
+    let mut asleep = server.viewer("demo");
+    let gone = server.viewer("demo");
+    assert_eq!(server.room("demo").unwrap()["viewers"], 49);
+    let mut gone = Some(gone);
+    let mut late = None;
+    let mut publisher = server.ready_publisher("demo");
+    paced(FRAMES, Duration::from_millis(20), |i| {
+        publisher.frame(f64::from(i) * 0.04, (f64::from(i) * 0.1).sin().abs());
+        if i == 30 {
+            // Without a close, as when a laptop's lid shuts.
+            drop(gone.take());
+        }
+        if i == 100 {
+            let mut viewer = server.viewer("demo");
+            let joined = Instant::now();
+            assert!(viewer.next_packet());
+            // A key packet it needs first may be older; the newest frame comes with it.
+            while viewer.frame.seq < 95 {
+                assert!(viewer.next_packet());
+            }
+            assert!(joined.elapsed() < Duration::from_millis(500), "late by {:?}", joined.elapsed());
+            late = Some(viewer);
+        }
+    });
+    let mut late = late.unwrap();
+    while late.frame.captured_at_micros < LAST_T {
+        assert!(late.next_packet());
+    }
+    for reader in readers {
+        let (num_frames, seq, points) = reader.join().unwrap();
+        assert_eq!((seq, &points), (FRAMES - 1, &late.frame.points), "all see the same face at the end");
+        assert!(num_frames >= 75, "a reading viewer saw only {num_frames} of {FRAMES} frames");
+    }
+    // The sleeper wakes: a few old frames, then the newest.
+    let mut num_frames = 0;
+    while asleep.frame.captured_at_micros < LAST_T {
+        assert!(asleep.next_packet());
+        num_frames += 1;
+    }
+    assert!(num_frames <= 40, "the sleeper found {num_frames} frames");
+    assert!(server.metric("rhytid_frames_dropped_total{reason=\"slow_viewer\"}") >= 50.0);
+    server.wait_for_room("demo", |room| room.is_some_and(|room| room["viewers"].as_u64() <= Some(2)));
+}
+
+#[test]
+fn a_viewer_that_sleeps_finds_half_a_second_of_old_frames_and_the_newest() {
+    let server = Server::start();
+    let mut viewer = server.json_viewer("demo");
+    let mut publisher = server.ready_publisher("demo");
+    paced(50, Duration::from_millis(20), |i| publisher.frame(f64::from(i) * 0.02, 0.5));
+    while viewer.next_json().seq < 45 {}
+    // Sleeps for four seconds: 200 frames, fewer than fit the kernel's buffers.
+    paced(200, Duration::from_millis(20), |i| publisher.frame(1.0 + f64::from(i) * 0.02, 0.5));
+    let mut num_old = 0;
+    while viewer.next_json().seq < 249 {
+        num_old += 1;
+    }
+    assert!(num_old <= 30, "{num_old} old frames of 20 ms");
+}
+
+#[test]
+fn a_taken_room_is_refused_and_takeover_takes_it() {
+    let server = Server::start();
+    let mut viewer = server.viewer("demo");
+    let mut first = server.ready_publisher("demo");
+    for i in 0..3 {
+        first.frame(f64::from(i), 0.5);
+    }
+    while viewer.frame.seq < 2 {
+        assert!(viewer.next_packet());
+    }
+
+    let mut second = server.publisher("demo");
+    second.send(r#"{"type":"hello","version":1,"source":"two"}"#);
+    let (code, message) = second.error();
+    assert_eq!(code, "room_taken");
+    assert!(message.contains("\"takeover\":true"), "{message}");
+    assert_eq!(second.close_frame().code, CloseCode::Policy);
+
+    let mut third = server.publisher("demo");
+    third.send(r#"{"type":"hello","version":1,"source":"three","takeover":true}"#);
+    assert!(third.text().contains(r#""session":2"#));
+    let (code, message) = first.error();
+    assert_eq!((code.as_str(), message.as_str()), ("taken_over", "another publisher has taken the room over"));
+    first.close_frame();
+    third.frame(0.0, 0.1);
+    while viewer.frame.session < 2 {
+        assert!(viewer.next_packet());
+    }
+    assert_eq!((viewer.frame.seq, viewer.frame.captured_at_micros), (0, 0), "a new session starts anew");
+    assert_eq!(server.room("demo").unwrap()["publisher"]["source"], "three");
+}
+
+#[test]
+fn a_face_that_drops_out_is_said_to_be_lost_and_comes_back() {
+    let server = Server::start();
+    let mut viewer = server.json_viewer("demo");
+    let mut publisher = server.ready_publisher("demo");
+    for i in 0..90 {
+        let t = f64::from(i) * 0.04;
+        if (30..60).contains(&i) {
+            publisher.send(&format!(r#"{{"type":"frame","t":{t},"face":false}}"#));
+        } else {
+            publisher.frame(t, 0.8);
+        }
+        let frame = viewer.next_json();
+        assert_eq!((frame.seq, frame.face), (i, !(30..60).contains(&i)));
+        assert!((frame.t - t).abs() <= 0.5e-6, "{} is not {t}", frame.t);
+        assert_eq!(frame.influence.len(), viewer.hello.character.poses.len());
+        assert!(frame.influence.iter().all(|row| row.len() == viewer.hello.character.bones.len()));
+        if i == 59 {
+            // Held for 250 ms and eased for 500: at rest by now.
+            for (bone, point) in viewer.hello.character.bones.iter().zip(&frame.bones) {
+                let far = bone.rest.iter().zip(point).any(|(rest, point)| (rest - point).abs() > 5e-5);
+                assert!(!far, "{} is not back at rest: {point:?}", bone.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn packets_are_those_of_the_pipeline_at_any_speed() {
+    let lines: Vec<String> = (0..60)
+        .map(|i| format!(r#"{{"type":"frame","t":{},"weights":{{"jawOpen":{}}}}}"#, f64::from(i) * 0.04, f64::from(i % 10) * 0.1))
+        .collect();
+    let hello = r#"{"type":"hello","version":1}"#;
+    let (character, _) = load_character(None).unwrap();
+    let (mut reader, mut frame) = (PublishReader::new(&character), TrackingFrame::default());
+    let Ok(PublishMessage::Hello(said)) = reader.read(hello, &mut frame) else { panic!("a good hello") };
+    let mut pipeline = Pipeline::new(character, &SolveConfig::default(), &said, 1).unwrap();
+    let wanted: Vec<Vec<u8>> = lines
+        .iter()
+        .map(|line| {
+            let mut packet = Vec::new();
+            reader.read(line, &mut frame).unwrap();
+            pipeline.frame(&frame, &mut packet).unwrap();
+            packet
+        })
+        .collect();
+
+    let server = Server::start();
+    for (room, pause) in [("fast", 0), ("slow", 15)] {
+        let mut viewer = server.viewer(room);
+        let mut publisher = server.publisher(room);
+        publisher.send(hello);
+        publisher.text();
+        for line in &lines {
+            publisher.send(line);
+            std::thread::sleep(Duration::from_millis(pause));
+        }
+        let mut got = Vec::new();
+        while got.last() != wanted.last() {
+            got.push(viewer.next_bytes());
+        }
+        assert!(got.iter().all(|packet| wanted.contains(packet)), "{room}: a packet the pipeline did not make");
+    }
+}
+
+#[test]
+fn a_publisher_that_vanishes_frees_its_room() {
+    let server = Server::with(|config| (config.timeouts.ping, config.timeouts.publisher_idle) = (0.1, 0.5));
+    // Its connection is cut without a close frame.
+    let publisher = server.ready_publisher("cut");
+    drop(publisher);
+    server.wait_for_room("cut", |room| room.is_some_and(|room| room["publisher"].is_null()));
+    server.ready_publisher("cut");
+    // Its connection stays and says nothing: pings are not answered, because nobody reads them.
+    let mut silent = server.ready_publisher("silent");
+    server.wait_for_room("silent", |room| room.is_some_and(|room| room["publisher"].is_null()));
+    let (code, message) = silent.error();
+    assert_eq!((code.as_str(), message.as_str()), ("idle", "nothing heard for 0.5 seconds"));
+    silent.close_frame();
+    server.ready_publisher("silent");
+}
+
+#[test]
+fn a_publisher_that_answers_pings_may_be_silent() {
+    let server = Server::with(|config| (config.timeouts.ping, config.timeouts.publisher_idle) = (0.1, 0.5));
+    let mut publisher = server.ready_publisher("demo");
+    publisher.socket.get_ref().set_read_timeout(Some(Duration::from_millis(50))).unwrap();
+    let start = Instant::now();
+    while start.elapsed() < Duration::from_millis(1500) {
+        // A time-out is no failure here; a ping is answered with the next read.
+        let _ = publisher.socket.read();
+    }
+    assert!(!server.room("demo").unwrap()["publisher"].is_null());
+}
+
+#[test]
+fn a_viewer_that_never_reads_is_ended_and_the_others_see_every_frame() {
+    let server = Server::with(|config| (config.timeouts.ping, config.timeouts.viewer_idle) = (0.1, 1.0));
+    let mut deaf = server.viewer("demo");
+    let mut viewer = server.viewer("demo");
+    let mut publisher = server.ready_publisher("demo");
+    for i in 0..100u32 {
+        publisher.frame(f64::from(i), 0.5);
+        while viewer.frame.seq < i {
+            assert!(viewer.next_packet());
+        }
+        std::thread::sleep(Duration::from_millis(15));
+    }
+    server.wait_for_room("demo", |room| room.is_some_and(|room| room["viewers"] == 1));
+    let said = loop {
+        if let Message::Text(text) = deaf.client.socket.read().unwrap() {
+            break text;
+        }
+    };
+    assert!(said.contains("no pong for 1 seconds"), "{said}");
+    drop(viewer);
+}
+
+#[test]
+fn empty_rooms_are_removed() {
+    let server = Server::with(|config| config.timeouts.room_idle = 0.2);
+    let publisher = server.ready_publisher("demo");
+    let viewer = server.viewer("demo");
+    std::thread::sleep(Duration::from_millis(600));
+    assert!(server.room("demo").is_some(), "a room in use stays");
+    drop((publisher, viewer));
+    server.wait_for_room("demo", |room| room.is_none());
+    assert_eq!(server.metric("rhytid_rooms"), 0.0);
+}
+
+#[test]
+fn an_orderly_end_tells_every_socket_why() {
+    let mut server = Server::start();
+    let mut viewer = server.viewer("demo");
+    let mut publisher = server.ready_publisher("demo");
+    let mut undecided = server.publisher("demo");
+    publisher.frame(0.0, 0.2);
+    assert!(viewer.next_packet());
+    server.stop();
+    for client in [&mut viewer.client, &mut publisher, &mut undecided] {
+        let frame = client.close_frame();
+        assert_eq!((frame.code, frame.reason.as_str()), (CloseCode::Away, "server is shutting down"));
+    }
+    let start = Instant::now();
+    server.wait();
+    assert!(start.elapsed() < Duration::from_secs(2), "it ends with its last socket");
+}
+
+#[test]
+fn a_calibration_is_answered() {
+    let server = Server::start();
+    let mut publisher = server.ready_publisher("demo");
+    for i in 0..50 {
+        publisher.frame(f64::from(i) * 0.04, 0.1);
+    }
+    publisher.send(r#"{"type":"calibrate"}"#);
+    let answer: serde_json::Value = serde_json::from_str(&publisher.text()).unwrap();
+    assert_eq!((answer["type"].as_str(), answer["requested"].as_bool()), (Some("calibrated"), Some(true)), "{answer}");
+    assert!(answer["t"].as_f64().is_some() && answer["frames"].as_u64().is_some(), "{answer}");
+}

@@ -1,0 +1,77 @@
+//! The sender, against a real server.
+
+use super::harness::Server;
+use rhytid_server::{SendError, SendOptions, SendReport, SendSource, send};
+use std::time::{Duration, Instant};
+
+fn feed(frames: u32, interval: f64) -> String {
+    let mut text = String::from("{\"type\":\"hello\",\"version\":1,\"source\":\"feed\"}\n");
+    for i in 0..frames {
+        text += &format!("{{\"type\":\"frame\",\"t\":{},\"weights\":{{\"jawOpen\":0.5}}}}\n", f64::from(i) * interval);
+    }
+    text
+}
+
+fn options(server: &Server, text: String) -> SendOptions {
+    SendOptions {
+        source: SendSource::Text(text, "test feed".into()),
+        to: format!("ws://{}", server.address),
+        room: "demo".into(),
+        speed: f64::INFINITY,
+        repeats: false,
+        takeover: false,
+    }
+}
+
+fn send_now(options: &SendOptions) -> Result<SendReport, SendError> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(send(options, &indicatif::ProgressBar::hidden()))
+}
+
+#[test]
+fn a_feed_is_sent_whole_at_full_speed_and_in_time_at_a_given_one() {
+    let server = Server::start();
+    let mut options = options(&server, feed(400, 0.01));
+    assert_eq!(send_now(&options).unwrap(), SendReport { frames: 400, errors: 0 });
+    assert_eq!(server.metric("rhytid_frames_in_total"), 400.0, "the server has read all of it when the sender ends");
+    options.source = SendSource::Text(feed(61, 0.05), "test feed".into());
+    options.speed = 4.0;
+    let start = Instant::now();
+    send_now(&options).unwrap();
+    let took = start.elapsed();
+    assert!((Duration::from_millis(740)..Duration::from_millis(2500)).contains(&took), "3 s at four times the speed took {took:?}");
+    assert_eq!(server.room("demo").unwrap()["session"], 2);
+}
+
+#[test]
+fn the_servers_words_reach_the_sender() {
+    let server = Server::start();
+    let _first = server.ready_publisher("demo");
+    let mut options = options(&server, feed(10, 0.04));
+    let error = send_now(&options).unwrap_err().to_string();
+    assert!(error.contains("the room has a publisher already"), "{error}");
+    options.takeover = true;
+    assert_eq!(send_now(&options).unwrap().frames, 10);
+    options.room = "no room".into();
+    let error = send_now(&options).unwrap_err().to_string();
+    assert!(error.contains("cannot connect"), "{error}");
+    // The sender cannot know this character's bones; the server does.
+    options.room = "demo".into();
+    options.source = SendSource::Text(feed(1, 0.0) + "{\"type\":\"frame\",\"t\":1,\"bones\":{\"tail\":[0,0,0]}}\n", "test feed".into());
+    assert_eq!(send_now(&options).unwrap(), SendReport { frames: 2, errors: 1 });
+    options.source = SendSource::Text(feed(2, 0.04) + "{\"type\":\"frame\",\"t\":1,\"landmarks\":7}\n", "test feed".into());
+    let error = send_now(&options).unwrap_err().to_string();
+    assert!(error.starts_with("feed test feed, line 4: field landmarks: invalid type"), "{error}");
+}
+
+#[test]
+fn each_loop_is_a_session_of_its_own() {
+    let server = Server::start();
+    let mut options = options(&server, feed(5, 0.01));
+    options.repeats = true;
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+    let sending = runtime.spawn(async move { send(&options, &indicatif::ProgressBar::hidden()).await });
+    server.wait_for_room("demo", |room| room.is_some_and(|room| room["session"].as_u64() >= Some(3)));
+    sending.abort();
+    runtime.shutdown_background();
+}
