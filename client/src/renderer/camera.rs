@@ -30,7 +30,7 @@ const FAR: f32 = 6.0;
 const PORTRAIT_FOVY: f32 = 0.42;
 /// Height of the picture in units of brow to chin: the whole head and the top of the shoulders, the face large enough for
 /// a face tracker. Tuned by eye.
-const PICTURE_HEIGHT_IN_FACES: f32 = 2.75;
+const PICTURE_HEIGHT_IN_FACES: f32 = 2.45;
 
 impl Camera {
     /// From the front on the neutral head: the face in the middle, room above it, a hint of shoulders.
