@@ -2,8 +2,8 @@
 
 use super::super::bust::{Bust, Region};
 use super::super::landmarks::mirror;
-use super::noise::smoothstep;
-use glam::{Vec2, Vec3};
+use super::noise::{lerp, smoothstep};
+use glam::{Mat3, Vec2, Vec3};
 
 /// Grid step of the unrolled skin, mm.
 const STEP: f32 = 0.5;
@@ -165,6 +165,31 @@ pub fn spline(points: &[Vec2], per_span: usize) -> Vec<Vec2> {
     out
 }
 
+/// The smooth arch (least-squares parabola) through points that run from the middle outwards or the other way.
+pub fn arch(points: &[Vec2]) -> Vec<Vec2> {
+    let (first, last) = (points[0].x, points[points.len() - 1].x);
+    let share = |p: &Vec2| (p.x - first) / (last - first);
+    // Normal equations of y = a + b t + c t^2 by Cramer's rule; t in [0, 1] keeps them well conditioned.
+    let sum = |of: &dyn Fn(&Vec2) -> f32| points.iter().map(of).sum::<f32>();
+    let powers = |p: &Vec2| {
+        let t = share(p);
+        [1.0, t, t * t, t * t * t, t * t * t * t]
+    };
+    let power = |n: usize| sum(&|p| powers(p)[n]);
+    let moment = |n: usize| sum(&|p| powers(p)[n] * p.y);
+    let matrix = |columns: [[f32; 3]; 3]| Mat3::from_cols_array_2d(&columns).determinant();
+    let columns = [[power(0), power(1), power(2)], [power(1), power(2), power(3)], [power(2), power(3), power(4)]];
+    let right = [moment(0), moment(1), moment(2)];
+    let all = matrix(columns);
+    let coefficient = |k: usize| {
+        let mut replaced = columns;
+        replaced[k] = right;
+        matrix(replaced) / all
+    };
+    let [a, b, c] = [0, 1, 2].map(coefficient);
+    (0..=32).map(|i| i as f32 / 32.0).map(|t| Vec2::new(lerp(first, last, t), a + (b + c * t) * t)).collect()
+}
+
 fn mean(points: &[Vec3]) -> Vec3 {
     points.iter().sum::<Vec3>() / points.len() as f32
 }
@@ -178,5 +203,13 @@ mod tests {
         let points = [Vec2::ZERO, Vec2::new(3.0, 1.0), Vec2::new(5.0, -2.0)];
         let curve = spline(&points, 8);
         assert_eq!((curve[0], curve[8], curve[16]), (points[0], points[1], points[2]));
+    }
+
+    #[test]
+    fn an_arch_is_the_parabola_its_points_lie_on() {
+        let points: Vec<Vec2> = [3.0, 5.0, 6.0, 9.0, 11.0].iter().map(|&x: &f32| Vec2::new(x, 2.0 + x - 0.1 * x * x)).collect();
+        for p in arch(&points) {
+            assert!((p.y - (2.0 + p.x - 0.1 * p.x * p.x)).abs() < 1e-4, "{p}");
+        }
     }
 }

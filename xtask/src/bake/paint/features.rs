@@ -163,7 +163,7 @@ impl<'a> Features<'a> {
             * smoothstep(0.2, 1.1, above_ball)
             * within
             * ahead
-            * lerp(0.45, 1.0, is_upper)
+            * lerp(0.28, 1.0, is_upper)
             * (1.0 - marks.socket);
         marks.upper_lid = texel.share(Region::Eyelid) * is_upper;
         marks.eye_corner = bell((texel.place - inner).length(), 2.8);
@@ -175,7 +175,8 @@ impl<'a> Features<'a> {
         let line = height_at(&self.hairline, mirrored.x);
         let inside = if mirrored.y > line { distance } else { -distance };
         let ragged = inside + 3.0 * fractal(place / 14.0, 2, 51) + 1.8 * noise(place / 3.5, 52);
-        smoothstep(-3.5, 8.5, ragged)
+        // Cut shorter round the ears and down to the nape.
+        smoothstep(-3.5, lerp(8.5, 19.0, smoothstep(80.0, 105.0, mirrored.x)), ragged)
     }
 
     fn beard(&self, at: Vec2, place: Vec3) -> f32 {
@@ -215,34 +216,13 @@ const HAIRLINE: [(f32, f32); 17] = [
     (95.0, -2.0),
     (99.0, -18.0),
     (101.0, -37.0),
-    (128.0, -43.0),
-    (135.0, -14.0),
-    (142.0, -48.0),
+    (137.0, -43.0),
+    (143.0, -16.0),
+    (150.0, -48.0),
     (165.0, -70.0),
     (205.0, -84.0),
     (252.0, -88.0),
 ];
-
-/// The smooth arch (least-squares parabola) through points that run from the middle outwards or the other way.
-pub fn arch(points: &[Vec2]) -> Vec<Vec2> {
-    let (first, last) = (points[0].x, points[points.len() - 1].x);
-    let share = |p: &Vec2| (p.x - first) / (last - first);
-    // Normal equations of y = a + b t + c t^2 by Cramer's rule; t in [0, 1] keeps them well conditioned.
-    let sum = |of: &dyn Fn(&Vec2) -> f32| points.iter().map(of).sum::<f32>();
-    let power = |n: i32| sum(&|p| share(p).powi(n));
-    let moment = |n: i32| sum(&|p| share(p).powi(n) * p.y);
-    let matrix = |columns: [[f32; 3]; 3]| glam::Mat3::from_cols_array_2d(&columns).determinant();
-    let columns = [[power(0), power(1), power(2)], [power(1), power(2), power(3)], [power(2), power(3), power(4)]];
-    let right = [moment(0), moment(1), moment(2)];
-    let all = matrix(columns);
-    let coefficient = |k: usize| {
-        let mut replaced = columns;
-        replaced[k] = right;
-        matrix(replaced) / all
-    };
-    let [a, b, c] = [0, 1, 2].map(coefficient);
-    (0..=32).map(|i| i as f32 / 32.0).map(|t| Vec2::new(lerp(first, last, t), a + (b + c * t) * t)).collect()
-}
 
 /// Distance to a curve, share of its length at the nearest point, unit direction there.
 fn nearest(curve: &[Vec2], at: Vec2) -> (f32, f32, Vec2) {
@@ -287,13 +267,5 @@ mod tests {
         assert!(contains(&square, Vec2::splat(0.5)) && !contains(&square, Vec2::new(1.5, 0.5)) && !contains(&square, Vec2::new(0.5, -0.5)));
         let (distance, share, _) = nearest(&square, Vec2::new(0.5, -0.5));
         assert_eq!((distance, share), (0.5, 0.125));
-    }
-
-    #[test]
-    fn an_arch_is_the_parabola_its_points_lie_on() {
-        let points: Vec<Vec2> = [3.0, 5.0, 6.0, 9.0, 11.0].iter().map(|&x: &f32| Vec2::new(x, 2.0 + x - 0.1 * x * x)).collect();
-        for p in arch(&points) {
-            assert!((p.y - (2.0 + p.x - 0.1 * p.x * p.x)).abs() < 1e-4, "{p}");
-        }
     }
 }

@@ -64,26 +64,33 @@ pub fn draw(atlas: &Atlas, features: &Features) -> Hairs {
                 let length = dice.range(kind.length.0, kind.length.1) * lerp(0.6, 1.0, density);
                 let start = Vec2::new(x as f32 + dice.unit(), y as f32 + dice.unit());
                 let Some(step) = in_texels(along, steps) else { continue };
-                let width = kind.half_width / (area.sqrt()).max(1e-4);
-                let tone = 0.75 + 0.6 * dice.unit() * dice.unit();
-                hairs.stroke(size, |x, y| atlas.is_covered(x, y), start, step * length, width, kind.strength * dice.range(0.6, 1.0), tone);
+                let stroke = Stroke {
+                    start,
+                    run: step * length,
+                    half_width: kind.half_width / area.sqrt().max(1e-4),
+                    strength: kind.strength * dice.range(0.6, 1.0),
+                    tone: 0.75 + 0.6 * dice.unit() * dice.unit(),
+                };
+                hairs.draw(atlas, &stroke);
             }
         }
     }
     hairs
 }
 
+/// A hair in the atlas, in texels.
+struct Stroke {
+    start: Vec2,
+    run: Vec2,
+    half_width: f32,
+    strength: f32,
+    tone: f32,
+}
+
 impl Hairs {
-    fn stroke(
-        &mut self,
-        size: usize,
-        is_skin: impl Fn(usize, usize) -> bool,
-        start: Vec2,
-        run: Vec2,
-        half_width: f32,
-        strength: f32,
-        tone: f32,
-    ) {
+    fn draw(&mut self, atlas: &Atlas, stroke: &Stroke) {
+        let size = atlas.size();
+        let Stroke { start, run, half_width, strength, tone } = *stroke;
         let num_steps = (run.length() * 1.5).ceil().clamp(1.0, 200.0) as usize;
         // Where a hair is narrower than a texel it covers that much less of it.
         let (spread, share) = (half_width.max(0.5), (2.0 * half_width).min(1.0));
@@ -95,7 +102,7 @@ impl Hairs {
             for dy in -reach..=reach {
                 for dx in -reach..=reach {
                     let (x, y) = (p.x.floor() as i32 + dx, p.y.floor() as i32 + dy);
-                    if !(0..size as i32).contains(&x) || !(0..size as i32).contains(&y) || !is_skin(x as usize, y as usize) {
+                    if !(0..size as i32).contains(&x) || !(0..size as i32).contains(&y) || !atlas.is_covered(x as usize, y as usize) {
                         continue;
                     }
                     let away = (Vec2::new(x as f32 + 0.5, y as f32 + 0.5) - p).length();

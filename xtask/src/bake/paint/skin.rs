@@ -16,7 +16,7 @@ const BASE_SRGB: [u8; 3] = [207, 161, 139];
 const MELANIN: Vec3 = Vec3::new(0.4143, 0.3570, 0.8372);
 const HAEMOGLOBIN: Vec3 = Vec3::new(0.2988, 0.6838, 0.6657);
 /// Colours of what is not skin, sRGB. Tuned by eye.
-const HAIR_SRGB: [u8; 3] = [40, 30, 25];
+const HAIR_SRGB: [u8; 3] = [43, 30, 23];
 const STUBBLE_SRGB: [u8; 3] = [80, 72, 72];
 const LIP_SRGB: [u8; 3] = [172, 106, 95];
 const MOUTH_SRGB: [u8; 3] = [112, 46, 44];
@@ -58,7 +58,7 @@ fn color(features: &Features, texel: &Texel, marks: &Marks, moles: &[(Vec3, f32,
     let mut color = rgb(BASE_SRGB) * Vec3::from_array(density.to_array().map(|d| libm::expf(-d)));
 
     // Shadow of hair and beard roots under the skin: darker and less red.
-    let roots = (0.66 * marks.hair).max(0.42 * marks.brow);
+    let roots = (0.66 * marks.hair).max(0.34 * marks.brow);
     color = color.lerp(rgb(HAIR_SRGB) * 1.5, roots);
     color = color.lerp(color * rgb(STUBBLE_SRGB) * 2.6, 0.30 * marks.beard);
 
@@ -73,7 +73,7 @@ fn color(features: &Features, texel: &Texel, marks: &Marks, moles: &[(Vec3, f32,
 
     // Where hardly any light comes in, skin is lit through itself: deep red-brown, not grey.
     let nose = features.chart.middle(&[31, 33, 35]);
-    let nostril = bell(((p - nose) / Vec3::new(14.0, 11.0, 14.0)).length(), 1.0) * smoothstep(0.42, 0.18, openness);
+    let nostril = bell(((p - nose) / Vec3::new(14.0, 11.0, 14.0)).length(), 1.0) * smoothstep(0.30, 0.12, openness);
     color = color.lerp(rgb(NOSTRIL_SRGB), 0.9 * nostril.min(1.0));
     let mouth = rgb(MOUTH_SRGB) * (1.0 + 0.25 * fractal(p / 4.0, 2, 21));
     color = color.lerp(mouth, marks.mouth);
@@ -145,7 +145,7 @@ fn moles(features: &Features) -> Vec<(Vec3, f32, f32)> {
     let chart = features.chart;
     let places = [
         (Vec2::new(41.0, -31.0), 0.95, 0.85),
-        (Vec2::new(-24.0, -66.0), 0.75, 0.65),
+        (Vec2::new(-19.0, -90.0), 0.7, 0.6),
         (Vec2::new(-55.0, -12.0), 0.65, 0.75),
         (Vec2::new(62.0, 6.0), 0.55, 0.6),
         (Vec2::new(-68.0, -52.0), 0.8, 0.6),

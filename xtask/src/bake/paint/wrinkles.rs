@@ -3,8 +3,7 @@
 
 use super::super::bust::{PoseField, SlopeMap};
 use super::atlas::Atlas;
-use super::chart::{Chart, Side, spline};
-use super::features::arch;
+use super::chart::{Chart, Side, arch, spline};
 use super::furrow::{Furrows, Stroke};
 use super::noise::{Dice, cells, lerp, noise, smoothstep};
 use super::slopes;
@@ -48,7 +47,9 @@ impl Dimples {
 }
 
 /// Influence below which furrows are no longer carved deeper to make up for it.
-const LEAST_INFLUENCE: f32 = 0.4;
+const LEAST_INFLUENCE: f32 = 0.45;
+/// Slope no fold is steeper than: beyond it light only shows noise.
+const STEEPEST: f32 = 1.25;
 
 /// The wrinkle map of a pose. Where the pose's bones have only a part of the skinning weights, so that the map is shown at
 /// that part even at the pose itself, the furrows are that much deeper; where they have none, nothing is drawn.
@@ -59,7 +60,10 @@ pub fn paint(chart: &Chart, atlas: &Atlas, pose: &PoseField) -> Result<SlopeMap>
         smoothstep(0.0, 0.15, influence) / influence.clamp(LEAST_INFLUENCE, 1.0)
     });
     for (slope, gain) in slopes.iter_mut().zip(gains) {
-        *slope = slope.zip(gain).map(|(p, gain)| p.map(|v| v * gain));
+        *slope = slope.zip(gain).map(|(p, gain)| {
+            let steepness = gain * Vec2::from_array(p).length();
+            p.map(|v| v * gain * (STEEPEST / steepness.max(STEEPEST)))
+        });
     }
     slopes::wrinkle_map(atlas.size(), &slopes)
 }
@@ -256,25 +260,20 @@ fn smile(pen: &mut Pen) {
     pen.seed = 500;
     for side in Side::BOTH {
         let outward = side.sign();
-        pen.line(
-            side,
-            &[(35, 4.5, 8.0), (35, 9.5, 2.0), (35, 15.5, -6.0), (54, 7.5, 5.5), (54, 9.5, -4.0), (54, 8.0, -12.0)],
-            1.35,
-            1.25,
-            |s| {
-                s.shoulder = 5.5;
-                s.bulge = 0.6;
-                s.lean = 0.6 * outward;
-                s.taper = (0.12, 0.4);
-                s.broken = 0.08;
-                s.stray = 0.8;
-                s.companions = 4;
-            },
-        );
-        pen.line(side, &[(54, 15.0, 11.0), (54, 17.5, 2.0), (54, 17.0, -8.0), (54, 13.5, -17.0)], 0.55, 1.1, |s| {
-            s.shoulder = 4.5;
+        let fold = [(35, 4.0, 9.0), (35, 9.0, 2.5), (35, 14.0, -6.0), (54, 8.0, 4.5), (54, 9.5, -4.0), (54, 8.5, -12.0)];
+        pen.line(side, &fold, 1.45, 1.5, |s| {
+            s.shoulder = 6.0;
+            s.bulge = 0.6;
+            s.lean = 0.6 * outward;
+            s.taper = (0.16, 0.4);
+            s.broken = 0.03;
+            s.stray = 0.45;
+            s.companions = 1;
+        });
+        pen.line(side, &[(54, 15.0, 11.0), (54, 17.5, 2.0), (54, 17.0, -8.0), (54, 13.5, -17.0)], 0.5, 1.2, |s| {
+            s.shoulder = 5.0;
             s.lean = 0.5 * outward;
-            s.companions = 2;
+            s.companions = 1;
         });
         pen.line(side, &[(54, 23.0, 6.0), (54, 24.5, -2.0), (54, 23.0, -11.0)], 0.28, 1.1, |s| s.shoulder = 4.5);
         pen.line(side, &[(54, 2.2, 3.0), (54, 3.6, -1.0), (54, 3.0, -6.0)], 0.55, 0.85, |s| s.shoulder = 2.6);
@@ -436,6 +435,20 @@ mod tests {
         let chart = Chart::new(&bust);
         let relief = relief(&chart, "stretch").expect("a known pose");
         assert_eq!(relief.height(Vec3::new(0.0, -86.0, 80.0), Vec3::Z), 0.0);
+    }
+
+    #[test]
+    fn maps_are_flat_where_no_bone_of_the_pose_reaches_and_the_same_every_time() {
+        let bust = head();
+        let (chart, atlas) = (Chart::new(&bust), Atlas::new(&bust, 256));
+        let influence = bust.positions.iter().map(|p| if p.x > 0.0 { 1.0 } else { 0.0 }).collect();
+        let pose = PoseField { name: "stretch", influence };
+        let first = paint(&chart, &atlas, &pose).expect("painted");
+        assert!(first.image.bytes == paint(&chart, &atlas, &pose).expect("painted").image.bytes);
+        let picture = image::load_from_memory(&first.image.bytes).expect("a PNG").to_rgb8();
+        let is_flat = |x: u32, y: u32| picture.get_pixel(x, y).0 == [128, 128, 255];
+        assert!((0..256).all(|y| (0..120).all(|x| is_flat(x, y))), "the right half has no influence");
+        assert!((0..256).any(|y| (136..256).any(|x| !is_flat(x, y))));
     }
 
     #[test]
