@@ -59,8 +59,6 @@ pub struct Eyeball {
 pub struct PoseField {
     /// Name in the file.
     pub name: &'static str,
-    /// Displacement of every vertex at the pose, metres.
-    pub displacements: Vec<Vec3>,
     /// Sum of the skinning weights of the bones the pose moves, 0 to 1: where wrinkles can show at all.
     pub influence: Vec<f32>,
 }

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 /// Shape of the cut, metres, head space; tuned by eye. Above the centre the ellipsoid goes on as a cylinder.
 const CENTRE: Vec3 = Vec3::new(0.0, -0.060, -0.012);
-const RADII: Vec3 = Vec3::new(0.188, 0.150, 0.150);
+const RADII: Vec3 = Vec3::new(0.196, 0.162, 0.162);
 /// Where along an edge from a vertex a crossing is so near that the vertex itself is moved onto the cut: no slivers.
 const SNAP: f32 = 0.34;
 /// How far inwards each ring of the closing surface lies (1 is the middle), and how far it is lifted above the ellipsoid's

@@ -126,10 +126,14 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
     }
 
     // Joints come first, so that joint and node indices are the same; the mesh's node is the last.
-    let mut nodes: Vec<Value> = rig.joints.iter().map(|joint| {
-        let parent = joint.parent.map_or(Vec3::ZERO, |parent| rig.joints[usize::from(parent)].position);
-        json!({ "name": joint.name, "translation": (joint.position - parent).to_array() })
-    }).collect();
+    let mut nodes: Vec<Value> = rig
+        .joints
+        .iter()
+        .map(|joint| {
+            let parent = joint.parent.map_or(Vec3::ZERO, |parent| rig.joints[usize::from(parent)].position);
+            json!({ "name": joint.name, "translation": (joint.position - parent).to_array() })
+        })
+        .collect();
     for j in 0..rig.joints.len() {
         let children: Vec<usize> = (0..rig.joints.len()).filter(|&c| rig.joints[c].parent == Some(j as u8)).collect();
         if !children.is_empty() {
@@ -138,7 +142,8 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
     }
     let inverse_binds = rig.joints.iter().map(|joint| glam::Mat4::from_translation(-joint.position).to_cols_array());
     let inverse_binds = writer.floats(inverse_binds, "MAT4");
-    if let Some(target) = writer.views[writer.accessors[inverse_binds]["bufferView"].as_u64().unwrap_or_default() as usize].as_object_mut() {
+    if let Some(target) = writer.views[writer.accessors[inverse_binds]["bufferView"].as_u64().unwrap_or_default() as usize].as_object_mut()
+    {
         target.remove("target");
     }
     nodes.push(json!({ "name": "face", "mesh": 0, "skin": 0 }));
@@ -187,9 +192,7 @@ fn materials(writer: &mut Writer, painted: &Painted) -> Vec<Value> {
     let surface = writer.texture(&painted.skin_surface, "skin_surface");
     let eye = writer.texture(&painted.eye_albedo, "eye_albedo");
     let teeth = writer.texture(&painted.teeth_albedo, "teeth_albedo");
-    let plain = |name: &str, color: [f32; 4], roughness: f32| {
-        json!({ "name": name, "pbrMetallicRoughness": { "baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": roughness } })
-    };
+    let plain = |name: &str, color: [f32; 4], roughness: f32| json!({ "name": name, "pbrMetallicRoughness": { "baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": roughness } });
     Material::ALL
         .iter()
         .map(|material| {
@@ -213,7 +216,7 @@ fn materials(writer: &mut Writer, painted: &Painted) -> Vec<Value> {
                     "pbrMetallicRoughness": { "baseColorTexture": { "index": teeth }, "metallicFactor": 0.0, "roughnessFactor": 0.25 },
                 }),
                 Material::Tongue => plain(name, [0.46, 0.16, 0.15, 1.0], 0.4),
-                Material::Brow => two_sided(plain(name, [0.045, 0.030, 0.022, 1.0], 0.6)),
+                Material::Brow => two_sided(plain(name, [0.080, 0.054, 0.038, 1.0], 0.65)),
                 Material::Lash => two_sided(plain(name, [0.020, 0.015, 0.012, 1.0], 0.5)),
             }
         })

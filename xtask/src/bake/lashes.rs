@@ -60,8 +60,9 @@ pub fn build(skin: &Skin, eyes: [Eyeball; 2]) -> Part {
                     .map(|k| {
                         let u = k as f32 / (NUM_KNOTS - 1) as f32;
                         let offset = (away * u + Vec3::Y * (slope * u + curl * u * u * 0.5)) * length;
-                        let morphs = (0..ARKIT_NAMES.len())
-                            .map(|shape| surface.morph(&root, shape) + if shape == blink { rotation * offset - offset } else { Vec3::ZERO });
+                        let morphs = (0..ARKIT_NAMES.len()).map(|shape| {
+                            surface.morph(&root, shape) + if shape == blink { rotation * offset - offset } else { Vec3::ZERO }
+                        });
                         Knot {
                             position: foot + offset - arm.normalize_or_zero() * 0.000_1,
                             normal: (Vec3::Y * 0.8 - away * 0.6) * if row.is_upper { -1.0 } else { 1.0 },

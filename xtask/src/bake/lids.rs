@@ -42,17 +42,22 @@ pub fn fields(mesh: &Mesh, regions: &[Region], eyes: [Eyeball; 2], ibug68: &[Vec
         }
         let eye = eyes[s];
         // Behind the ball's middle the angle means nothing.
-        let is_in_front = |v: usize| mesh.positions[v].z > eye.centre.z - 0.002 && mesh.positions[v].distance(eye.centre) < 2.2 * eye.radius;
+        let is_in_front =
+            |v: usize| mesh.positions[v].z > eye.centre.z - 0.002 && mesh.positions[v].distance(eye.centre) < 2.2 * eye.radius;
         let angles = |name: &str| turn_angles(&mesh.positions, &mesh.morphs[shape(name)], eye.centre, 0.010);
         let field = |angles: Vec<f32>, full_degrees: f32| {
-            let mut field: Vec<f32> =
-                angles.iter().enumerate().map(|(v, angle)| if is_in_front(v) { (angle.to_degrees() / full_degrees).clamp(0.0, 1.0) } else { 0.0 }).collect();
+            let mut field: Vec<f32> = angles
+                .iter()
+                .enumerate()
+                .map(|(v, angle)| if is_in_front(v) { (angle.to_degrees() / full_degrees).clamp(0.0, 1.0) } else { 0.0 })
+                .collect();
             autorig::smooth(&graph, &mut field, 1, |_, _| true);
             field
         };
         let upper = field(angles(BLINKS[s]), SHUT_DEGREES);
         let squint = angles(SQUINTS[s]);
-        let mut lowest: Vec<f32> = (0..squint.len()).filter(|&v| is_in_front(v) && regions[v] == Region::Eyelid).map(|v| squint[v]).collect();
+        let mut lowest: Vec<f32> =
+            (0..squint.len()).filter(|&v| is_in_front(v) && regions[v] == Region::Eyelid).map(|v| squint[v]).collect();
         lowest.sort_by(f32::total_cmp);
         // A hundredth of the lid may turn further than full: noise near the corners.
         let full = lowest.get(lowest.len() / 100).copied().unwrap_or(-0.1).min(-0.01);

@@ -97,11 +97,17 @@ pub struct Part {
 }
 
 /// Displacements shorter than this are left out, metres: below what a pixel shows.
-pub const LEAST_DELTA: f32 = 1.2e-4;
+const LEAST_DELTA: f32 = 1.5e-4;
+/// From this length on they are kept whole; between the two they fade, so that no step is left on the skin.
+const WHOLE_DELTA: f32 = 3.0e-4;
 
 /// The entries of a dense displacement list worth storing.
 pub fn sparse(deltas: impl Iterator<Item = Vec3>) -> Vec<(u32, Vec3)> {
-    deltas.enumerate().filter(|(_, delta)| delta.length() > LEAST_DELTA).map(|(v, delta)| (v as u32, delta)).collect()
+    let fade = |delta: Vec3| {
+        let share = ((delta.length() - LEAST_DELTA) / (WHOLE_DELTA - LEAST_DELTA)).clamp(0.0, 1.0);
+        delta * share
+    };
+    deltas.map(fade).enumerate().filter(|(_, delta)| *delta != Vec3::ZERO).map(|(v, delta)| (v as u32, delta)).collect()
 }
 
 #[cfg(test)]

@@ -57,16 +57,7 @@ pub const POSES: [PoseRecipe; 4] = [
     PoseRecipe {
         name: "pucker",
         shapes: &[("mouthPucker", 1.15), ("mouthShrugLower", 0.5)],
-        bones: &[
-            "lip_corner",
-            "lip_upper_outer",
-            "lip_upper",
-            "lip_upper_mid",
-            "lip_lower_outer",
-            "lip_lower",
-            "lip_lower_mid",
-            "chin",
-        ],
+        bones: &["lip_corner", "lip_upper_outer", "lip_upper", "lip_upper_mid", "lip_lower_outer", "lip_lower", "lip_lower_mid", "chin"],
         by_hand: &[("lip_corner", mm(-2.0, 0.0, 0.0)), ("chin", mm(0.0, 1.6, 0.3))],
     },
 ];
@@ -80,7 +71,8 @@ impl PoseRecipe {
             .filter_map(|(bone, reach)| {
                 let stem = bone.name.strip_suffix("_l").or(bone.name.strip_suffix("_r")).unwrap_or(&bone.name);
                 self.bones.contains(&stem).then(|| {
-                    let from_shapes: Vec3 = self.shapes.iter().map(|&(name, weight)| mesh.morphs[shape(name)][reach.vertex as usize] * weight).sum();
+                    let from_shapes: Vec3 =
+                        self.shapes.iter().map(|&(name, weight)| mesh.morphs[shape(name)][reach.vertex as usize] * weight).sum();
                     let mirror = Vec3::new(if bone.name.ends_with("_r") { -1.0 } else { 1.0 }, 1.0, 1.0);
                     let by_hand: Vec3 = self.by_hand.iter().filter(|(name, _)| *name == stem).map(|&(_, delta)| delta * mirror).sum();
                     (bone.name.clone(), from_shapes + by_hand)

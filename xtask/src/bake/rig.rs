@@ -68,7 +68,11 @@ const SKIN_BONES: [SkinBone; 16] = [
     lower_lip(bone("lip_lower_outer", &[(55, 1.0)], &[(55, 0.7), (65, 0.15), (54, 0.15)], 0.025)),
     lower_lip(bone("lip_lower", &[(56, 1.0)], &[(56, 0.7), (65, 0.3)], 0.025)),
     midline(lower_lip(bone("lip_lower_mid", &[(57, 1.0)], &[(57, 0.6), (66, 0.4)], 0.026))),
-    midline(SkinBone { turns_with_jaw: true, zone: Zone::LowerLip, ..moved(bone("chin", &[(8, 1.0)], &[(8, 0.6), (7, 0.2), (9, 0.2)], 0.034), 0.0, 0.012, 0.0) }),
+    midline(SkinBone {
+        turns_with_jaw: true,
+        zone: Zone::LowerLip,
+        ..moved(bone("chin", &[(8, 1.0)], &[(8, 0.6), (7, 0.2), (9, 0.2)], 0.034), 0.0, 0.012, 0.0)
+    }),
     midline(bone("glabella", &[(21, 0.5), (22, 0.5)], &[(21, 0.5), (22, 0.5)], 0.024)),
 ];
 
@@ -209,4 +213,3 @@ impl Rig {
 const EYE_RANGE_DEGREES: [f32; 2] = [26.0, 20.0];
 /// A jaw opens by 20.7 degrees in the shape `jawOpen`; a yawn by more.
 const JAW_MAX_DEGREES: f32 = 27.0;
-

@@ -6,7 +6,6 @@ use super::brows;
 use super::bust::{Bust, Eyeball, PoseField, Region};
 use super::cut::cut_bust;
 use super::landmarks::{BROW, IBUG_VERTICES};
-use super::{lids, lips};
 use super::mesh::{Face, Mesh};
 use super::part::{Material, Part, sparse};
 use super::poses::POSES;
@@ -17,6 +16,7 @@ use super::subdivide::{counteract_shrinking, subdivide};
 use super::surface::Surface;
 use super::uv;
 use super::weights::{self, Weights, shape};
+use super::{lids, lips};
 use anyhow::{Context, Result};
 use glam::{Vec2, Vec3, Vec4};
 use rhytid_shared::ARKIT_NAMES;
@@ -98,7 +98,18 @@ impl Skin {
             .into_iter()
             .map(|angle| (angle / JAW_OPEN_RADIANS).clamp(0.0, 1.0))
             .collect();
-        let weights = weights::build(&weights::Skin { mesh: &mesh, regions: &regions, lips: &lip_sides, jaw, lids: lids.fields, jaw_pivot, jaw_open: JAW_OPEN_RADIANS }, &rig);
+        let weights = weights::build(
+            &weights::Skin {
+                mesh: &mesh,
+                regions: &regions,
+                lips: &lip_sides,
+                jaw,
+                lids: lids.fields,
+                jaw_pivot,
+                jaw_open: JAW_OPEN_RADIANS,
+            },
+            &rig,
+        );
         Ok(Self { mesh, regions, ibug68, eyes, rig, weights })
     }
 
@@ -148,13 +159,9 @@ impl Skin {
         let normals = self.mesh.normals(&self.mesh.positions);
         let poses = POSES.iter().map(|recipe| {
             let moved = recipe.displacements(&self.mesh, &self.rig);
-            let of_joint: BTreeMap<u8, Vec3> = moved.into_iter().map(|(name, delta)| (self.rig.joint_of(&name), delta)).collect();
-            let weights = corners.iter().map(|&(v, _)| &self.weights[v as usize]);
-            PoseField {
-                name: recipe.name,
-                displacements: weights.clone().map(|w| w.iter().filter_map(|(j, w)| Some(*of_joint.get(j)? * *w)).sum()).collect(),
-                influence: weights.map(|w| w.iter().filter(|(j, _)| of_joint.contains_key(j)).map(|&(_, w)| w).sum()).collect(),
-            }
+            let joints: Vec<u8> = moved.keys().map(|name| self.rig.joint_of(name)).collect();
+            let share = |v: u32| self.weights[v as usize].iter().filter(|(joint, _)| joints.contains(joint)).map(|&(_, w)| w).sum();
+            PoseField { name: recipe.name, influence: corners.iter().map(|&(v, _)| share(v)).collect() }
         });
         let positions: Vec<Vec3> = corners.iter().map(|&(v, _)| self.mesh.positions[v as usize]).collect();
         let normals: Vec<Vec3> = corners.iter().map(|&(v, _)| normals[v as usize]).collect();

