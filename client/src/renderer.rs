@@ -1,5 +1,6 @@
 //! Draws a character with wgpu: no storage buffers, no compute, within WebGL2's limits.
 
+mod anatomy;
 mod background;
 mod camera;
 mod coefficients;
@@ -9,6 +10,7 @@ mod layouts;
 mod pipelines;
 mod present;
 mod read_back;
+mod regions;
 mod shadow;
 mod studio;
 pub mod uniforms;
@@ -24,12 +26,12 @@ pub(crate) use read_back::read_back;
 pub use view::{BlendError, BlendMode, ViewError, ViewMode};
 
 use crate::asset::{CharacterAsset, Palette, Surface};
+use anatomy::{Mouth, eyeballs};
 use glam::{Affine3A, Vec3};
 use layouts::Layouts;
 use pipelines::{Key, Look, Pipelines};
 use present::{Presenter, Targets};
 use rhytid_shared::Character;
-use rhytid_shared::character::{Bone, Drive};
 use shadow::Shadow;
 use std::sync::Arc;
 use upload::{CharacterGroup, Primitive, Uploader};
@@ -89,7 +91,7 @@ impl Renderer {
     pub fn new(device: &wgpu::Device, queue: &wgpu::Queue, asset: &CharacterAsset, target_format: wgpu::TextureFormat) -> Self {
         let layouts = Layouts::new(device);
         let mut uploader = Uploader { device, queue, bytes: 0 };
-        let primitives: Vec<Primitive> = asset.primitives.iter().map(|primitive| uploader.primitive(&layouts, primitive)).collect();
+        let primitives: Vec<Primitive> = asset.primitives.iter().map(|primitive| uploader.primitive(&layouts, asset, primitive)).collect();
         let group = uploader.character(&layouts, asset);
         let frame_block = uploader.uniform("frame", size_of::<uniforms::Frame>());
         let shadow = Shadow::new(device, &layouts);
@@ -107,8 +109,7 @@ impl Renderer {
             layout: &layouts.frame_unlit,
             entries: &[upload::entry(0, frame_block.as_entire_binding())],
         });
-        let parts = primitives.iter().map(|primitive| (primitive.surface, primitive.is_double_sided, primitive.alpha));
-        let pipelines = Pipelines::new(device, &layouts, asset.character.num_poses(), parts);
+        let pipelines = Pipelines::new(device, &layouts, asset.character.num_poses(), &primitives);
         Self {
             character: Arc::clone(&asset.character),
             palette: asset.palette.clone(),
@@ -297,13 +298,16 @@ impl Renderer {
                 if primitive.surface == Surface::Wet && !is_lit {
                     continue;
                 }
-                let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha);
-                let Some(pipeline) = self.pipelines.surface(key) else { continue };
-                pass.set_pipeline(pipeline);
                 pass.set_bind_group(2, &primitive.material, &[]);
                 pass.set_vertex_buffer(0, primitive.vertices.slice(..));
                 pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
-                pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
+                for region in &primitive.regions {
+                    let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha, region.poses);
+                    if let Some(pipeline) = self.pipelines.surface(key) {
+                        pass.set_pipeline(pipeline);
+                        pass.draw_indexed(region.indices.clone(), 0, 0..1);
+                    }
+                }
             }
         }
     }
@@ -336,65 +340,4 @@ impl Bounds {
         let radius = positions().map(|position| position.distance(centre)).fold(0.01, f32::max);
         Self { centre, radius }
     }
-}
-
-/// The opening of the lips.
-struct Mouth {
-    /// Between the inner lips at rest, head space.
-    middle: Vec3,
-    /// Half its width at rest, metres.
-    half_width: f32,
-    /// How far the corners lie behind the middle, in units of `half_width`.
-    corner_depth: f32,
-    /// How far the lips are apart, in units of `half_width`.
-    gap: f32,
-}
-
-impl Mouth {
-    fn new(character: &Character, frame: &RenderFrame) -> Self {
-        let marks = &character.ibug68;
-        let (upper, lower) = (marks[62], marks[66]);
-        let middle = (upper + lower) * 0.5;
-        let half_width = (0.5 * marks[60].distance(marks[64])).max(1e-3);
-        // The bone that follows the inner lip; where none does, the nearest.
-        let share = |bone: &Bone, landmark: usize| match &bone.drive {
-            Drive::Skin { landmarks } => landmarks.iter().filter(|entry| entry.landmark == landmark).map(|entry| entry.weight).sum(),
-            _ => 0.0_f32,
-        };
-        let lift = |landmark: usize| {
-            let best = (0..character.num_bones()).max_by(|&a, &b| {
-                let [(share_a, far_a), (share_b, far_b)] =
-                    [a, b].map(|i| (share(&character.bones[i], landmark), character.bones[i].rest.distance_squared(marks[landmark])));
-                share_a.total_cmp(&share_b).then(far_b.total_cmp(&far_a))
-            });
-            best.map_or(0.0, |bone| frame.points[bone].y - character.bones[bone].rest.y)
-        };
-        Self {
-            middle,
-            half_width,
-            corner_depth: (middle.z - 0.5 * (marks[60].z + marks[64].z)) / half_width,
-            gap: (lift(62) - lift(66)).max(0.0) / half_width,
-        }
-    }
-
-    /// How deep light reaches, in units of `half_width`: hardly to the teeth where the lips meet, behind the tongue's
-    /// tip where they stand wide apart. Tuned by eye.
-    fn light_reach(&self) -> f32 {
-        0.32 + 1.5 * (self.gap / 0.7).min(1.0)
-    }
-}
-
-/// Centres and radii of the eyeballs: the pivots of the eye bones, else from the landmarks. Left, then right.
-fn eyeballs(character: &Character) -> [[f32; 4]; 2] {
-    use rhytid_shared::character::Side;
-    // An adult's eyeball measures 24 mm across and the corners of the lids lie 86 mm apart (Farkas 1994).
-    let radius = character.interocular() * 0.14;
-    let centre = |side: Side, corners: [usize; 2]| {
-        let pivot = character.bones.iter().find_map(|bone| match bone.drive {
-            Drive::Eye { eye, pivot, .. } if eye == side => Some(pivot),
-            _ => None,
-        });
-        pivot.unwrap_or_else(|| (character.ibug68[corners[0]] + character.ibug68[corners[1]]) * 0.5 - Vec3::Z * radius * 0.8)
-    };
-    [centre(Side::Left, [42, 45]).extend(radius).to_array(), centre(Side::Right, [36, 39]).extend(radius).to_array()]
 }

@@ -1,6 +1,7 @@
 //! Builds pipelines. They never change once built; what changes per frame is an argument.
 
 use super::layouts::Layouts;
+use super::upload::Primitive;
 use super::view::BlendMode;
 use crate::asset::{Alpha, Surface, Vertex};
 use std::collections::BTreeMap;
@@ -38,6 +39,8 @@ pub struct Key {
     pub shader: ShaderKind,
     pub is_double_sided: bool,
     pub has_coverage: bool,
+    /// Poses whose maps are read, one bit each.
+    pub poses: u8,
 }
 
 /// The pass that draws a surface.
@@ -73,7 +76,7 @@ pub struct Pipelines {
 
 impl Pipelines {
     /// Pipelines for parts with these surfaces; `num_poses` becomes a constant of the shaders.
-    pub fn new(device: &wgpu::Device, layouts: &Layouts, num_poses: usize, parts: impl Iterator<Item = (Surface, bool, Alpha)>) -> Self {
+    pub fn new(device: &wgpu::Device, layouts: &Layouts, num_poses: usize, primitives: &[Primitive]) -> Self {
         let module = |label: &str, source: &str| {
             device
                 .create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.into()) })
@@ -88,12 +91,12 @@ impl Pipelines {
         let influence = module("influence", rhytid_shaders::INFLUENCE);
         let normals = module("normals", rhytid_shaders::NORMALS);
         let mut surfaces = BTreeMap::new();
-        for (surface, is_double_sided, alpha) in parts {
-            let blends = 0..BlendMode::ALL.len();
-            let looks =
-                [Look::Bare, Look::Influence].into_iter().chain(blends.clone().map(Look::Wrinkled)).chain(blends.map(Look::Normals));
-            for look in looks {
-                let key = Key::new(look, surface, is_double_sided, alpha);
+        let blends = 0..BlendMode::ALL.len();
+        let looks: Vec<Look> =
+            [Look::Bare, Look::Influence].into_iter().chain(blends.clone().map(Look::Wrinkled)).chain(blends.map(Look::Normals)).collect();
+        for primitive in primitives {
+            for (look, region) in looks.iter().flat_map(|&look| primitive.regions.iter().map(move |region| (look, region))) {
+                let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha, region.poses);
                 surfaces.entry(key).or_insert_with(|| {
                     let own = modules.iter().find(|(kind, _)| *kind == key.shader).map_or(&normals, |(_, module)| module);
                     let (module, vertex_entry, fragment_entry) = match key.look {
@@ -106,7 +109,7 @@ impl Pipelines {
                         Look::Wrinkled(blend) | Look::Normals(blend) => blend,
                         Look::Bare | Look::Influence => 0,
                     };
-                    let constants = [("NUM_POSES", num_poses as f64), ("BLEND", blend as f64)];
+                    let constants = [("NUM_POSES", num_poses as f64), ("BLEND", blend as f64), ("POSES", f64::from(key.poses))];
                     scene_pipeline(
                         device,
                         &SceneParts {
@@ -155,11 +158,11 @@ impl Pipelines {
 }
 
 impl Key {
-    /// Only skin has wrinkles, so all else is drawn bare when the face is drawn with them.
-    pub fn new(look: Look, surface: Surface, is_double_sided: bool, alpha: Alpha) -> Self {
+    /// What no pose can wrinkle, and all that is not skin, is drawn bare when the face is drawn with wrinkles.
+    pub fn new(look: Look, surface: Surface, is_double_sided: bool, alpha: Alpha, poses: u8) -> Self {
         let shader = ShaderKind::from(surface);
         let look = match look {
-            Look::Wrinkled(_) if shader != ShaderKind::Skin => Look::Bare,
+            Look::Wrinkled(_) if shader != ShaderKind::Skin || poses == 0 => Look::Bare,
             look => look,
         };
         let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
@@ -168,6 +171,7 @@ impl Key {
             shader: if is_lit { shader } else { ShaderKind::Plain },
             is_double_sided,
             has_coverage: is_lit && alpha == Alpha::Coverage && shader == ShaderKind::Hair,
+            poses: if matches!(look, Look::Wrinkled(_) | Look::Normals(_)) { poses } else { 0 },
         }
     }
 }

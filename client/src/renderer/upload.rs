@@ -2,6 +2,7 @@
 
 use super::coefficients::pose_table;
 use super::layouts::Layouts;
+use super::regions::{self, Region};
 use super::uniforms;
 use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, PrimitiveAsset, Surface, Texels};
 use std::collections::BTreeSet;
@@ -28,6 +29,8 @@ pub struct Primitive {
     pub vertices: wgpu::Buffer,
     pub indices: wgpu::Buffer,
     pub num_indices: u32,
+    /// The triangles by the poses that can wrinkle them.
+    pub regions: Vec<Region>,
     /// Each edge once, as pairs of indices.
     pub edges: wgpu::Buffer,
     pub num_edge_indices: u32,
@@ -130,16 +133,18 @@ impl Uploader<'_> {
     }
 
     /// One part with its material.
-    pub fn primitive(&mut self, layouts: &Layouts, asset: &PrimitiveAsset) -> Primitive {
+    pub fn primitive(&mut self, layouts: &Layouts, character: &CharacterAsset, asset: &PrimitiveAsset) -> Primitive {
         let edges = edges(&asset.indices);
+        let (indices, regions) = regions::split(character, asset);
         let label = |what: &str| format!("{} {what}", asset.name);
         Primitive {
             surface: asset.surface,
             alpha: asset.material.alpha,
             is_double_sided: asset.material.is_double_sided,
             vertices: self.filled(&label("vertices"), bytemuck::cast_slice(&asset.vertices), wgpu::BufferUsages::VERTEX),
-            indices: self.filled(&label("triangles"), bytemuck::cast_slice(&asset.indices), wgpu::BufferUsages::INDEX),
-            num_indices: asset.indices.len() as u32,
+            indices: self.filled(&label("triangles"), bytemuck::cast_slice(&indices), wgpu::BufferUsages::INDEX),
+            num_indices: indices.len() as u32,
+            regions,
             edges: self.filled(&label("edges"), bytemuck::cast_slice(&edges), wgpu::BufferUsages::INDEX),
             num_edge_indices: edges.len() as u32,
             material: self.material(layouts, &asset.name, &asset.material),

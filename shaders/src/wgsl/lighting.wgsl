@@ -91,7 +91,10 @@ fn mouth_light(rest: vec3<f32>) -> f32 {
     let offset = (rest - frame.mouth.xyz) / half_width;
     // The lips curve back towards their corners.
     let depth = -offset.z - offset.x * offset.x * frame.mouth_shape.y;
-    let inside = (1.0 - smoothstep(0.85, 1.1, abs(offset.x))) * (1.0 - smoothstep(0.7, 1.0, abs(offset.y)));
-    let is_mouth = inside * (1.0 - smoothstep(2.6, 3.0, depth));
+    // The deeper, the wider the cavity: at the lips it is no wider than their opening.
+    let width = min(0.85 + 0.5 * depth, 1.15);
+    let height = min(0.12 + 0.75 * depth, 0.75);
+    let inside = (1.0 - smoothstep(width, width + 0.15, abs(offset.x))) * (1.0 - smoothstep(height, height + 0.15, abs(offset.y)));
+    let is_mouth = inside * (1.0 - smoothstep(2.2, 2.6, depth));
     return 1.0 - 0.98 * is_mouth * smoothstep(0.10, frame.mouth_shape.x, depth);
 }

@@ -4,15 +4,16 @@
 
 // How much of the fine normal each colour loses, and how far each wraps past the terminator. Tuned by eye.
 const SMOOTHED: vec3<f32> = vec3<f32>(0.34, 0.15, 0.08);
-const WRAP: vec3<f32> = vec3<f32>(0.26, 0.11, 0.07);
+const WRAP: vec3<f32> = vec3<f32>(0.17, 0.09, 0.065);
 // Reflectance at normal incidence of the skin's oil (index 1.4).
 const F0: f32 = 0.028;
 
 fn diffuse(normal: vec3<f32>, smooth_normal: vec3<f32>, light: vec3<f32>) -> vec3<f32> {
     let n_dot_l = mix(vec3<f32>(dot(normal, light)), vec3<f32>(dot(smooth_normal, light)), SMOOTHED);
     let wrapped = max((n_dot_l + WRAP) / (1.0 + WRAP), vec3<f32>(0.0));
-    // Squared near zero, so that the terminator has no edge; light that wraps is light that is missing elsewhere.
-    return wrapped * mix(wrapped, vec3<f32>(1.0), smoothstep(vec3<f32>(0.0), vec3<f32>(0.3), wrapped)) / (1.0 + 0.5 * WRAP);
+    // Light that wraps is light that is missing elsewhere. The terminator has no edge.
+    let toe = smoothstep(0.0, 0.35, wrapped.g + 0.12);
+    return wrapped * mix(0.45, 1.0, toe) / (1.0 + 0.5 * WRAP);
 }
 
 fn shade(in: Varyings, normal: vec3<f32>) -> vec4<f32> {
@@ -41,7 +42,8 @@ fn shade(in: Varyings, normal: vec3<f32>) -> vec4<f32> {
         diffuse_light += arriving * diffuse(normal, smooth_normal, light);
         let oily = highlight(normal, view, light, roughness * 0.62, F0);
         let dry = highlight(normal, view, light, roughness, F0);
-        specular += arriving * mix(dry, oily, 0.22);
+        // Rims outline by their diffuse light; their highlights would look like sweat.
+        specular += arriving * mix(dry, oily, 0.22) * select(1.0, 0.35, i > 1u);
     }
     let n_dot_v = clamp(dot(normal, view), 0.0, 1.0);
     let reflected = reflect(-view, normal);

@@ -14,6 +14,9 @@ struct Material {
     occlusion_strength: f32,
 }
 
+// Poses that can wrinkle what is drawn, one bit each; the maps of the others are not read.
+override POSES: u32 = 255u;
+
 @group(1) @binding(3) var wrinkle_maps: texture_2d_array<f32>;
 @group(1) @binding(4) var wrinkle_sampler: sampler;
 
@@ -25,7 +28,8 @@ struct Material {
 @group(2) @binding(4) var map_sampler: sampler;
 
 struct Varyings {
-    @builtin(position) clip: vec4<f32>,
+    // Invariant: neighbouring regions of the face are drawn by different pipelines and must meet.
+    @builtin(position) @invariant clip: vec4<f32>,
     @location(0) world: vec3<f32>,
     // Unit per vertex, not renormalised per fragment: tangent spaces of bakers are read that way.
     @location(1) normal: vec3<f32>,
@@ -87,6 +91,9 @@ fn influence(in: Varyings, pose: u32) -> f32 {
 fn wrinkled_normal(in: Varyings) -> vec3<f32> {
     var blend = begin_blend(base_slope(in.uv));
     for (var pose = 0u; pose < NUM_POSES; pose += 1u) {
+        if ((POSES >> pose) & 1u) == 0u {
+            continue;
+        }
         let map = slope_of(textureSample(wrinkle_maps, wrinkle_sampler, in.uv, pose).xy, pose_table.scales[pose / 4u][pose % 4u]);
         blend = add_wrinkle(blend, map, pose_table.contains_neutral[pose / 4u][pose % 4u], influence(in, pose));
     }
