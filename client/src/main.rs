@@ -6,6 +6,7 @@ use rhytid_client::film::{self, FilmArgs};
 #[cfg(feature = "embedded")]
 use rhytid_client::render_cli::{self, RenderArgs, StillArgs};
 use rhytid_client::view::{self, ViewArgs};
+use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -47,9 +48,9 @@ fn main() -> ExitCode {
 }
 
 fn run(cli: Cli) -> anyhow::Result<()> {
-    let level = ["warn", "warn,rhytid=info", "warn,rhytid=debug"][usize::from(cli.verbose.min(2))];
+    let level = ["error,rhytid=warn", "warn,rhytid=info", "warn,rhytid=debug"][usize::from(cli.verbose.min(2))];
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal()).init();
     match cli.command {
         Command::View(args) => view::run(args)?,
         Command::Film(args) => {

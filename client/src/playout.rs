@@ -107,6 +107,8 @@ struct Session {
     /// In the order of sequence and of capture time, at least one.
     frames: VecDeque<Snapshot>,
     received: SequenceWindow,
+    /// When the newest frame came, viewer's clock, microseconds.
+    newest_came_at: i64,
     /// How far the moment shown lay past the newest frame when it was last sampled, microseconds; 0 where it did not.
     underrun: i64,
 }
@@ -189,6 +191,7 @@ impl Playout {
             clock: PlayoutClock::starting(captured_at, now),
             frames: VecDeque::from([snapshot]),
             received: SequenceWindow::starting(frame.seq),
+            newest_came_at: now,
             underrun: 0,
         });
         // The first face ever is shown at once; later ones fade in.
@@ -215,7 +218,7 @@ impl Playout {
             Some(session) => {
                 session.clock.advance(now);
                 let underrun_before = session.underrun;
-                self.state = session.sample(session.clock.play_time(now), &self.rest, &mut self.wanted);
+                self.state = session.sample(session.clock.play_time(now), now, &self.rest, &mut self.wanted);
                 if session.clock.take_jump() {
                     blend_length = Some(MAX_BLEND);
                 } else if underrun_before > 0 && session.underrun < underrun_before {
@@ -286,11 +289,12 @@ impl Session {
             self.frames.pop_front();
         }
         self.frames.push_back(snapshot);
+        self.newest_came_at = now;
         Pushed::Accepted
     }
 
-    /// Writes the face at `play_time` (sender's clock) into `out` and drops the frames that are over.
-    fn sample(&mut self, play_time: i64, rest: &RenderFrame, out: &mut RenderFrame) -> PlayoutState {
+    /// Writes the face at `play_time` (sender's clock), which is `now` (viewer's clock), into `out` and drops the frames that are over.
+    fn sample(&mut self, play_time: i64, now: i64, rest: &RenderFrame, out: &mut RenderFrame) -> PlayoutState {
         while self.frames.get(1).is_some_and(|next| next.captured_at <= play_time) {
             self.frames.pop_front();
         }
@@ -304,7 +308,9 @@ impl Session {
             }
             None if past > 0 => {
                 self.underrun = past;
-                let eased = (past - HOLD.as_micros() as i64) as f32 / EASE.as_micros() as f32;
+                // Frames that come too late for their moment are no silence: the newest of them is held.
+                let silence = past.min(now - self.newest_came_at);
+                let eased = (silence - HOLD.as_micros() as i64) as f32 / EASE.as_micros() as f32;
                 mix::mix(&before.frame, rest, smoothstep(eased.clamp(0.0, 1.0)), out);
                 if eased >= 1.0 {
                     return PlayoutState::Idle;

@@ -11,7 +11,7 @@ pub(crate) use look::{ACCENT, FAINT, TEXT, apply as apply_look};
 pub(crate) use painter::Painter;
 
 use crate::asset::{AssetError, CharacterAsset};
-use crate::renderer::RenderError;
+use crate::renderer::{RenderError, ViewError, ViewMode};
 use crate::spectator::{Spectator, StatusKind, WatchArgs};
 use panel::{Rates, Scene};
 use rhytid_shared::DEFAULT_CHARACTER_GLB;
@@ -32,6 +32,9 @@ pub struct ViewArgs {
     /// Whom to watch.
     #[command(flatten)]
     pub watch: WatchArgs,
+    /// What is shown first: beauty, bare, split, influence, influence:POSE, normals or wireframe
+    #[arg(long, value_name = "VIEW", default_value = "beauty")]
+    pub view: String,
     /// Save a picture of the whole window to this PNG once the face has been live for half a second, then close
     #[arg(long, value_name = "FILE.png")]
     pub screenshot: Option<PathBuf>,
@@ -57,6 +60,9 @@ pub enum WindowError {
     /// The character cannot be drawn.
     #[error(transparent)]
     Asset(#[from] AssetError),
+    /// The view is unknown.
+    #[error(transparent)]
+    View(#[from] ViewError),
     /// The screenshot cannot be written.
     #[error("screenshot {path:?} cannot be written: {source}")]
     Write {
@@ -95,13 +101,15 @@ struct Wake;
 /// Until the server names another character the default one is drawn.
 pub fn run(args: ViewArgs) -> Result<(), WindowError> {
     let asset = CharacterAsset::from_glb(DEFAULT_CHARACTER_GLB)?;
+    let mut switches = Switches::new(&asset.character);
+    switches.show(ViewMode::parse(&args.view, &asset.character)?);
     let event_loop = EventLoop::<Wake>::with_user_event().build().map_err(|error| WindowError::NoDisplay(plain_words(&error)))?;
     let proxy = event_loop.create_proxy();
     // The event loop is gone only when the window is.
     let wake = move || drop(proxy.send_event(Wake));
     let mut app = App {
         spectator: Spectator::open(args.watch, Arc::clone(&asset.character), wake),
-        switches: Switches::new(&asset.character),
+        switches,
         asset,
         gpu: None,
         rates: Rates::default(),

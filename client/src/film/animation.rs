@@ -35,8 +35,8 @@ pub(super) struct Palette {
 impl Palette {
     /// Colours for pictures like these.
     pub(super) fn of(pictures: &[RgbaImage]) -> Self {
-        // Every third pixel of every picture is more than the network learns from anyway.
-        let samples: Vec<u8> = pictures.iter().flat_map(|picture| picture.pixels().step_by(3)).flat_map(|pixel| pixel.0).collect();
+        let samples: Vec<u8> = pictures.iter().flat_map(|picture| picture.pixels()).flat_map(|pixel| pixel.0).collect();
+        // Learning from a third of the pixels is enough and takes 50 ms.
         let colors = color_quant::NeuQuant::new(3, NUM_COLORS, &samples).color_map_rgb();
         let colors = colors.chunks_exact(3).map(|color| [color[0], color[1], color[2]]).collect();
         Self { colors, nearest: vec![None; 1 << (3 * LOOK_UP_BITS)] }
@@ -51,8 +51,9 @@ impl Palette {
         let middle = color.map(|channel| i32::from(channel >> (8 - LOOK_UP_BITS) << (8 - LOOK_UP_BITS)) + half_step);
         let distance = |entry: &[u8; 3]| {
             let [r, g, b] = [0, 1, 2].map(|c| middle[c] - i32::from(entry[c]));
-            // Eyes tell greens apart best, blues least.
-            3 * r * r + 6 * g * g + b * b
+            // A cheap stand-in for what eyes tell apart (Riemersma, "Colour metric").
+            let (red, blue) = if middle[0] >= 128 { (3, 2) } else { (2, 3) };
+            red * r * r + 4 * g * g + blue * b * b
         };
         let index = (0..self.colors.len()).min_by_key(|&index| distance(&self.colors[index])).unwrap_or(0) as u8;
         self.nearest[key] = Some(index);

@@ -96,7 +96,7 @@ fn lay_out(painter: &egui::Painter, cells: &[Cell], title: &str, size: egui::Vec
     }
 }
 
-fn paint(crew: &Crew, context: &egui::Context, output: egui::FullOutput, size: [u32; 2]) -> Result<RgbaImage, FilmError> {
+fn paint(crew: &Crew, context: &egui::Context, mut output: egui::FullOutput, size: [u32; 2]) -> Result<RgbaImage, FilmError> {
     let (device, queue) = crew.headless.device();
     let texture = device.create_texture(&wgpu::TextureDescriptor {
         label: Some("contact sheet"),
@@ -110,11 +110,13 @@ fn paint(crew: &Crew, context: &egui::Context, output: egui::FullOutput, size: [
     });
     let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
     let mut painter = Painter::new(device, FORMAT);
-    painter.upload(device, queue, &output.textures_delta);
+    painter.upload(device, queue, &mut output.textures_delta);
     let primitives = context.tessellate(output.shapes, output.pixels_per_point);
     let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("contact sheet") });
     painter.paint(device, queue, &mut encoder, &view, size, output.pixels_per_point, &primitives);
-    Ok(read_back(device, queue, encoder, &texture, size)?)
+    let sheet = read_back(device, queue, encoder, &texture, size)?;
+    painter.free(output.textures_delta);
+    Ok(sheet)
 }
 
 #[cfg(test)]

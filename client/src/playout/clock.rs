@@ -17,6 +17,9 @@ const DELAY_RANGE: [i64; 2] = [40_000, 250_000];
 const MAX_SLEW: f64 = 0.05;
 /// From this distance on, microseconds, slewing would take longer (5 s) than anybody wants to wait: jump.
 const JUMP: i64 = 250_000;
+/// A way that has been slower by [`JUMP`] for this long, microseconds, without one fast packet is no stall: a stall ends in
+/// a burst whose last packet is fast. The sender paused its clock, or plays a feed slower than life.
+const SLOWER_FOR_GOOD: i64 = 500_000;
 
 /// Estimates the smallest transit of 10 s, the jitter and the send interval, and from them how far behind the viewer's
 /// clock the face is shown: `lag = min(received - captured) + delay`, `delay = clamp(2 T + q95(jitter), 40 ms, 250 ms)`.
@@ -35,6 +38,8 @@ pub(super) struct PlayoutClock {
     lag: f64,
     advanced_to: i64,
     has_jumped: bool,
+    /// When the first of an unbroken row of packets came that took longer than the fastest by [`JUMP`].
+    slow_since: Option<i64>,
 }
 
 impl PlayoutClock {
@@ -51,6 +56,7 @@ impl PlayoutClock {
             lag: 0.0,
             advanced_to: received_at,
             has_jumped: false,
+            slow_since: None,
         };
         clock.lag = clock.target() as f64;
         clock
@@ -70,6 +76,10 @@ impl PlayoutClock {
         if transit < self.fastest - JUMP {
             // The sender's clock ran ahead, or what came before was an old frame kept for late viewers.
             self.transits.clear();
+        }
+        self.slow_since = (transit > self.fastest + JUMP).then(|| self.slow_since.unwrap_or(received_at));
+        if let Some(since) = self.slow_since.take_if(|since| received_at - *since >= SLOWER_FOR_GOOD) {
+            self.transits.retain(|&(at, _)| at >= since);
         }
         while self.transits.front().is_some_and(|&(at, _)| at < received_at - WINDOW) || self.transits.len() == MAX_TRANSITS {
             self.transits.pop_front();
@@ -174,6 +184,24 @@ mod tests {
         clock.note_arrival(40 * MS, 0, 140 * MS);
         clock.advance(1000 * MS);
         assert_eq!(clock.lag - start, 50_000.0);
+    }
+
+    #[test]
+    fn sender_that_paused_its_clock_is_followed_and_a_stall_is_not_taken_for_one() {
+        let mut clock = PlayoutClock::starting(0, 0);
+        let mut run = |from: i64, count: i64, transit: &dyn Fn(i64) -> i64| {
+            (from..from + count).any(|k| {
+                clock.note_arrival(k * 40 * MS, (k - 1) * 40 * MS, k * 40 * MS + transit(k));
+                clock.take_jump()
+            })
+        };
+        assert!(!run(1, 99, &|_| 0));
+        // Two seconds in which nothing gets through, then all at once, up to the packet sent last.
+        assert!(!run(100, 50, &|k| (149 - k) * 40 * MS));
+        assert!(!run(150, 50, &|_| 0));
+        // Two seconds in which the sender's clock stood still: all packets after are two seconds behind.
+        assert!(run(200, 30, &|_| 2000 * MS));
+        assert!((clock.play_time(230 * 40 * MS + 2000 * MS) - 230 * 40 * MS).abs() <= 250 * MS);
     }
 
     #[test]

@@ -61,11 +61,12 @@ fn a_moment_between_two_frames_is_interpolated() {
             .map(|(at, value)| Snapshot { captured_at: at * MS, face: true, frame: RenderFrame::from(&face(1, 0, 0, value)) })
             .into(),
         received: SequenceWindow::starting(0),
+        newest_came_at: 33 * MS,
         underrun: 0,
     };
     let rest = at_rest();
     let mut out = rest.clone();
-    assert_eq!(session.sample(1012 * MS, &rest, &mut out), PlayoutState::Live);
+    assert_eq!(session.sample(1012 * MS, 45 * MS, &rest, &mut out), PlayoutState::Live);
     assert!((x(&out) - 0.418_181_82).abs() < 1e-6, "{}", x(&out));
     assert!((out.influences[1] - 0.209_090_91).abs() < 1e-6);
     assert!((out.points[0].y - (0.05 + 0.004_181_818)).abs() < 1e-6, "bones move with the same u");
@@ -369,6 +370,18 @@ fn reordered_and_repeated_packets_are_left_out() {
     assert!(seen.stats.late > 10 && seen.stats.duplicates > 10, "{seen:?}");
     // Between the neighbours of a frame left out the line is longer.
     assert!(seen.worst_error < 4.0 * CHORD_ERROR && seen.worst_step < TRUE_STEP * 1.5, "{seen:?}");
+}
+
+#[test]
+fn feed_played_at_half_speed_never_looks_like_silence() {
+    let mut playout = playout();
+    for k in 0..500 {
+        // 25 frames a second that are 20 ms apart on the sender's clock.
+        playout.push(&face(1, k, 20 * MS * i64::from(k), 0.5), ms(40 * i64::from(k)));
+        playout.sample(ms(40 * i64::from(k)));
+        assert_eq!(playout.state(), PlayoutState::Live, "after {k} frames");
+        assert!(x(playout.sample(ms(40 * i64::from(k) + 20))) > 0.49, "the newest frame is held");
+    }
 }
 
 proptest! {

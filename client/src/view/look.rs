@@ -43,7 +43,7 @@ pub(crate) fn apply(ctx: &egui::Context) {
     ctx.set_theme(Theme::Dark);
     ctx.all_styles_mut(|style| {
         style.spacing.item_spacing = vec2(6.0, 6.0);
-        style.spacing.button_padding = vec2(8.0, 5.0);
+        style.spacing.button_padding = vec2(4.0, 5.0);
         style.interaction.selectable_labels = false;
         style.animation_time = 0.1;
         for (text_style, size) in [(TextStyle::Body, 13.5), (TextStyle::Button, 13.0), (TextStyle::Small, 11.5), (TextStyle::Heading, 22.0)]

@@ -24,19 +24,19 @@ impl Painter {
         }
     }
 
-    /// Uploads egui's textures. Every output needs this, drawn or not.
-    pub(crate) fn upload(&mut self, device: &wgpu::Device, queue: &wgpu::Queue, textures: &egui::TexturesDelta) {
-        for (id, deltas) in &textures.set {
-            for delta in deltas {
-                self.renderer.update_texture(device, queue, *id, delta);
+    /// Uploads egui's new textures. Every output needs this, drawn or not.
+    pub(crate) fn upload(&mut self, device: &wgpu::Device, queue: &wgpu::Queue, textures: &mut egui::TexturesDelta) {
+        for (id, deltas) in std::mem::take(&mut textures.set) {
+            for delta in &deltas {
+                self.renderer.update_texture(device, queue, id, delta);
             }
         }
     }
 
-    /// Frees textures egui no longer uses.
-    pub(crate) fn free(&mut self, textures: &egui::TexturesDelta) {
-        for id in &textures.free {
-            self.renderer.free_texture(id);
+    /// Frees textures egui no longer uses, once what used them is submitted.
+    pub(crate) fn free(&mut self, mut textures: egui::TexturesDelta) {
+        for id in std::mem::take(&mut textures.free) {
+            self.renderer.free_texture(&id);
         }
     }
 

@@ -13,7 +13,7 @@ use rhytid_shared::Character;
 /// Width of the panel, points.
 const PANEL_WIDTH: f32 = 288.0;
 /// Height of a pose's bars, points.
-const BARS_HEIGHT: f32 = 34.0;
+const BARS_HEIGHT: f32 = 24.0;
 
 /// What the panel shows. Changes nothing but the switches.
 pub(crate) struct Scene<'a> {
@@ -162,8 +162,7 @@ fn view_switches(ui: &mut Ui, character: &Character, switches: &mut Switches) {
     for row in views(switches.pose).chunks(3) {
         ui.horizontal(|ui| {
             for &(view, name) in row {
-                let button = look::switch(name, is_on(view, switches.draw.view)).min_size(vec2(width, 28.0));
-                if ui.add(button).clicked() {
+                if ui.add_sized([width, 28.0], look::switch(name, is_on(view, switches.draw.view))).clicked() {
                     switches.choose_view(view, character);
                 }
             }
@@ -182,20 +181,19 @@ fn view_switches(ui: &mut Ui, character: &Character, switches: &mut Switches) {
 }
 
 fn wrinkle_switches(ui: &mut Ui, switches: &mut Switches) {
-    let width = ui.available_width();
-    let label = if switches.draw.wrinkles { "Wrinkles on" } else { "Wrinkles off" };
-    if ui.add(look::switch(label, switches.draw.wrinkles).min_size(vec2(width, 28.0))).clicked() {
-        switches.draw.wrinkles = !switches.draw.wrinkles;
-    }
-    let width = (width - 2.0 * ui.spacing().item_spacing.x) / 3.0;
+    let label = if switches.draw.wrinkles { "On" } else { "Off" };
+    let modes = [
+        (BlendMode::PartialDerivatives, "Sum", "Sum of partial derivatives (Jimenez et al. 2011)"),
+        (BlendMode::Simple, "Mean", "Mean of whole normals (Dutreve et al. 2009, 5.3)"),
+        (BlendMode::Printed, "Printed", "The formula as Dutreve et al. 2009 print it, with a rest term"),
+    ];
+    let width = (ui.available_width() - 3.0 * ui.spacing().item_spacing.x) / 4.0;
     ui.horizontal(|ui| {
-        for mode in BlendMode::ALL {
-            let (name, hint) = match mode {
-                BlendMode::PartialDerivatives => ("Derivatives", "Sum of partial derivatives (Jimenez et al. 2011)"),
-                BlendMode::Simple => ("Simple", "Mean of whole normals (Dutreve et al. 2009, 5.3)"),
-                BlendMode::Printed => ("Printed", "The formula as Dutreve et al. 2009 print it, with a rest term"),
-            };
-            if ui.add(look::switch(name, switches.draw.blend == mode).min_size(vec2(width, 28.0))).on_hover_text(hint).clicked() {
+        if ui.add_sized([width, 28.0], look::switch(label, switches.draw.wrinkles)).on_hover_text("Wrinkles on or off").clicked() {
+            switches.draw.wrinkles = !switches.draw.wrinkles;
+        }
+        for (mode, name, hint) in modes {
+            if ui.add_sized([width, 28.0], look::switch(name, switches.draw.blend == mode)).on_hover_text(hint).clicked() {
                 switches.draw.blend = mode;
             }
         }
@@ -207,23 +205,35 @@ fn numbers(ui: &mut Ui, scene: &Scene<'_>) {
     let (link, playout, rates) = (&scene.link, &scene.playout, scene.rates);
     // Half the way there and back, and what playout adds; the sender's own clock cannot be compared with ours.
     let latency = link.round_trip.map_or_else(|| "–".into(), |way| millis(way / 2 + playout.delay));
-    let rows = [
-        ("Pictures", format!("{:.0} /s", rates.pictures.per_second()), "Pictures drawn a second"),
-        ("Packets", format!("{:.0} /s", rates.packets.per_second()), "Frame packets received a second"),
-        ("Bytes", bytes_a_second(rates.bytes.per_second()), "Payload of frame packets a second"),
+    let numbers = [
+        ("Pictures", a_second(rates.pictures.per_second()), "Pictures drawn a second"),
         ("Latency", latency, "Server to screen: half a round trip and the playout delay"),
-        ("Playout delay", millis(playout.delay), "How much later than possible the face is shown, so that it moves evenly"),
+        ("Packets", a_second(rates.packets.per_second()), "Frame packets received a second"),
+        ("Delay", millis(playout.delay), "Playout delay: how much later than possible the face is shown, so that it moves evenly"),
+        ("Bytes", bytes_a_second(rates.bytes.per_second()), "Payload of frame packets a second"),
         ("Jitter", millis(playout.jitter), "95 % of packets are late by no more than this"),
-        ("Skipped", (playout.late + playout.duplicates + link.garbage).to_string(), "Packets that came late, twice, or broken"),
     ];
-    for (name, value, hint) in rows {
-        let row = ui.horizontal(|ui| {
-            ui.label(RichText::new(name).color(FAINT));
-            ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| ui.label(RichText::new(value).color(TEXT)));
+    let gap = 20.0;
+    let width = (ui.available_width() - gap) / 2.0;
+    for pair in numbers.chunks(2) {
+        ui.horizontal(|ui| {
+            ui.spacing_mut().item_spacing.x = gap;
+            for (name, value, hint) in pair {
+                let (rect, response) = ui.allocate_exact_size(vec2(width, 17.0), Sense::hover());
+                let font = FontId::proportional(13.0);
+                ui.painter().text(rect.left_center(), Align2::LEFT_CENTER, name, font.clone(), FAINT);
+                ui.painter().text(rect.right_center(), Align2::RIGHT_CENTER, value, font, TEXT);
+                response.on_hover_text(*hint);
+            }
         });
-        row.response.on_hover_text(hint);
     }
-    ui.label(RichText::new(scene.adapter).small().color(FAINT));
+    let skipped = playout.late + playout.duplicates + playout.misfits + link.garbage;
+    let skipped = if skipped == 0 { String::new() } else { format!("{skipped} packets skipped · ") };
+    ui.label(RichText::new(format!("{skipped}{}", scene.adapter)).small().color(FAINT));
+}
+
+fn a_second(rate: f64) -> String {
+    if rate < 9.95 { format!("{rate:.1} /s") } else { format!("{rate:.0} /s") }
 }
 
 fn bytes_a_second(rate: f64) -> String {
@@ -265,7 +275,7 @@ fn pose_bars(ui: &mut Ui, scene: &Scene<'_>, k: usize, name: &str) {
             response.on_hover_text_at_pointer(format!("{}  {:.0} %", bone.name, 100.0 * value));
         }
     }
-    ui.add_space(4.0);
+    ui.add_space(2.0);
 }
 
 fn key_help(ui: &mut Ui) {

@@ -74,17 +74,23 @@ impl Switches {
     pub(crate) fn choose_view(&mut self, view: ViewMode, character: &Character) {
         if matches!((view, self.draw.view), (ViewMode::Influence(_), ViewMode::Influence(_))) {
             let next = self.pose.map_or(0, |pose| pose + 1);
-            self.pose = (next < character.num_poses()).then_some(next);
-            self.draw.view = ViewMode::Influence(self.pose);
+            self.choose_pose((next < character.num_poses()).then_some(next));
         } else {
-            self.draw.view = view;
+            self.show(view);
+        }
+    }
+
+    /// Shows `view`.
+    pub(crate) fn show(&mut self, view: ViewMode) {
+        self.draw.view = view;
+        if let ViewMode::Influence(pose) = view {
+            self.pose = pose;
         }
     }
 
     /// Shows the influence of one pose, or of all.
     pub(crate) fn choose_pose(&mut self, pose: Option<usize>) {
-        self.pose = pose;
-        self.draw.view = ViewMode::Influence(pose);
+        self.show(ViewMode::Influence(pose));
     }
 
     /// Turns the camera by a drag of `points` in a picture `height` points high.

@@ -139,11 +139,11 @@ impl GpuWindow {
             wgpu::CurrentSurfaceTexture::Suboptimal(texture) => (texture, true),
             wgpu::CurrentSurfaceTexture::Outdated | wgpu::CurrentSurfaceTexture::Lost => {
                 self.surface.configure(&self.device, &self.surface_config);
-                self.painter.free(&freed);
+                self.painter.free(freed);
                 return Ok(Drawn::Again);
             }
             wgpu::CurrentSurfaceTexture::Timeout | wgpu::CurrentSurfaceTexture::Occluded => {
-                self.painter.free(&freed);
+                self.painter.free(freed);
                 return Ok(Drawn::Hidden);
             }
             wgpu::CurrentSurfaceTexture::Validation => return Err(WindowError::Surface("the surface gave no picture to draw into".into())),
@@ -151,7 +151,7 @@ impl GpuWindow {
         let view = texture.texture.create_view(&wgpu::TextureViewDescriptor::default());
         let encoder = self.record(&view, &primitives, pixels_per_point, scene.frame, switches);
         self.queue.submit([encoder.finish()]);
-        self.painter.free(&freed);
+        self.painter.free(freed);
         self.window.pre_present_notify();
         self.queue.present(texture);
         if is_suboptimal {
@@ -178,7 +178,7 @@ impl GpuWindow {
         let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
         let encoder = self.record(&view, &primitives, pixels_per_point, scene.frame, switches);
         let mut picture = read_back(&self.device, &self.queue, encoder, &texture, size)?;
-        self.painter.free(&freed);
+        self.painter.free(freed);
         if matches!(self.surface_config.format, wgpu::TextureFormat::Bgra8Unorm | wgpu::TextureFormat::Bgra8UnormSrgb) {
             picture.pixels_mut().for_each(|pixel| pixel.0.swap(0, 2));
         }
@@ -192,7 +192,7 @@ impl GpuWindow {
         let input = self.egui.take_egui_input(&self.window);
         let context = self.egui.egui_ctx().clone();
         let mut face_rect = egui::Rect::ZERO;
-        let output = context.run_ui(input, |ui| face_rect = panel::show(ui, scene, switches));
+        let mut output = context.run_ui(input, |ui| face_rect = panel::show(ui, scene, switches));
         self.egui.handle_platform_output(&self.window, output.platform_output);
         if switches.is_full_screen != was_full_screen {
             self.window.set_fullscreen(switches.is_full_screen.then_some(Fullscreen::Borderless(None)));
@@ -203,7 +203,7 @@ impl GpuWindow {
         if self.face.size != face_size {
             self.face = FaceTexture::new(&self.device, &mut self.painter, face_size, Some(self.face.id));
         }
-        self.painter.upload(&self.device, &self.queue, &output.textures_delta);
+        self.painter.upload(&self.device, &self.queue, &mut output.textures_delta);
         (context.tessellate(output.shapes, output.pixels_per_point), output.pixels_per_point, output.textures_delta)
     }
 
