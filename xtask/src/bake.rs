@@ -90,3 +90,62 @@ fn bake(source: &mut source::Source) -> Result<Vec<u8>> {
     ensure!(bytes.len() <= MAX_BYTES, "the character takes {} bytes, at most {MAX_BYTES} are wanted", bytes.len());
     Ok(bytes)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rhytid_shared::layout::IBUG_MIRROR;
+    use rhytid_shared::{DEFAULT_CHARACTER_GLB, NUM_ARKIT_SHAPES};
+
+    fn committed() -> Character {
+        Character::from_glb(DEFAULT_CHARACTER_GLB).expect("the committed character is valid")
+    }
+
+    #[test]
+    fn committed_character_has_the_bones_poses_and_shapes_it_shall_have() {
+        let character = committed();
+        assert!(DEFAULT_CHARACTER_GLB.len() <= MAX_BYTES);
+        for side in ["_l", "_r"] {
+            for stem in
+                ["brow_inner", "brow_mid", "brow_outer", "brow_tail", "lid_upper", "lid_lower", "eye", "cheek", "nose_wing", "lip_corner"]
+            {
+                assert!(character.bone_index(&format!("{stem}{side}")).is_some(), "{stem}{side}");
+            }
+        }
+        assert!(character.bone_index("jaw").is_some() && character.bone_index("chin").is_some());
+        let names: Vec<&str> = character.poses.iter().map(|pose| pose.name.as_str()).collect();
+        assert_eq!(names, ["stretch", "compress", "smile", "pucker"]);
+        assert!(character.poses.iter().all(|pose| pose.map.is_some()));
+        assert_eq!(character.shapes.len(), NUM_ARKIT_SHAPES);
+    }
+
+    #[test]
+    fn committed_landmarks_are_mirror_images_up_to_a_real_face_s_asymmetry() {
+        let marks = committed().ibug68;
+        let mut mean = 0.0;
+        for (landmark, &mirror) in IBUG_MIRROR.iter().enumerate() {
+            let mut other = marks[mirror];
+            other.x = -other.x;
+            let distance = marks[landmark].distance(other);
+            assert!(distance < 2.5e-3, "landmark {landmark} is {distance} m from its mirror image");
+            mean += distance / IBUG_MIRROR.len() as f32;
+        }
+        assert!(mean > 1.0e-4, "the halves are alike: {mean} m");
+    }
+
+    #[test]
+    fn brows_of_the_reference_poses_go_where_the_muscles_pull() {
+        let character = committed();
+        let travel = |pose: usize, bone: &str| {
+            let i = character.bone_index(bone).expect("checked above");
+            character.poses[pose].points[i] - character.bones[i].rest
+        };
+        for (side, outwards) in [("_l", 1.0), ("_r", -1.0)] {
+            assert!(travel(0, &format!("brow_mid{side}")).y > 7.0e-3);
+            let frown = travel(1, &format!("brow_inner{side}"));
+            assert!(frown.y < -4.0e-3 && frown.x * outwards < -2.0e-3);
+            let smile = travel(2, &format!("lip_corner{side}"));
+            assert!(smile.y > 5.0e-3 && smile.x * outwards > 4.0e-3 && smile.z < -2.0e-3);
+        }
+    }
+}

@@ -35,8 +35,8 @@ pub fn fitted_shapes() -> Vec<usize> {
 }
 
 /// Weights of the vertex `v` over `movers`, none negative, summing to at most one. `prior` has a weight for each mover;
-/// one of exactly 0 stays 0.
-pub fn fit(mesh: &Mesh, shapes: &[usize], jaw_open: f32, v: usize, movers: &[Mover], prior: &[f32]) -> Vec<f32> {
+/// one of exactly 0 stays 0. `hold` multiplies how firmly weights are held to it.
+pub fn fit(mesh: &Mesh, shapes: &[usize], jaw_open: f32, v: usize, movers: &[Mover], prior: &[f32], hold: f32) -> Vec<f32> {
     let active: Vec<usize> = (0..movers.len()).filter(|&b| prior[b] > 0.0).collect();
     let n = active.len();
     let (sin, cos) = libm::sincosf(jaw_open);
@@ -64,8 +64,8 @@ pub fn fit(mesh: &Mesh, shapes: &[usize], jaw_open: f32, v: usize, movers: &[Mov
     }
     let mut weights: Vec<f32> = active.iter().map(|&b| prior[b]).collect();
     for i in 0..n {
-        gram[i * n + i] += HOLD;
-        target[i] += HOLD * weights[i];
+        gram[i * n + i] += HOLD * hold;
+        target[i] += HOLD * hold * weights[i];
     }
     for _ in 0..NUM_SWEEPS {
         for i in 0..n {
@@ -103,13 +103,13 @@ mod tests {
     #[test]
     fn fit_finds_the_mixture_a_vertex_was_made_of() {
         let movers = [0, 1].map(|vertex| Mover::Skin { vertex, turns: false });
-        let weights = fit(&mixed(), &fitted_shapes(), 0.36, 2, &movers, &[0.5, 0.3]);
+        let weights = fit(&mixed(), &fitted_shapes(), 0.36, 2, &movers, &[0.5, 0.3], 1.0);
         assert!((weights[0] - 0.3).abs() < 0.01 && (weights[1] - 0.5).abs() < 0.01, "{weights:?}");
     }
 
     #[test]
     fn a_bone_the_automatic_rig_forbids_stays_out() {
         let movers = [0, 1].map(|vertex| Mover::Skin { vertex, turns: false });
-        assert_eq!(fit(&mixed(), &fitted_shapes(), 0.36, 2, &movers, &[0.5, 0.0])[1], 0.0);
+        assert_eq!(fit(&mixed(), &fitted_shapes(), 0.36, 2, &movers, &[0.5, 0.0], 1.0)[1], 0.0);
     }
 }

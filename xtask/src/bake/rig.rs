@@ -28,13 +28,44 @@ struct SkinBone {
     follows: &'static [(usize, f32)],
     /// Distance along the skin at which its influence ends, metres.
     reach: f32,
+    /// Where else the muscles it stands for pull the skin.
+    echoes: &'static [Pull],
     zone: Zone,
     turns_with_jaw: bool,
     gain: [f32; 3],
 }
 
+/// A place away from the bone that its muscle moves too: furrows of the forehead lie well above the brows.
+struct Pull {
+    /// From the bone, metres, left side; snapped onto the skin.
+    offset: Vec3,
+    /// Influence there.
+    strength: f32,
+    /// As for the bone.
+    reach: f32,
+}
+
+const fn pull(x_mm: f32, y_mm: f32, strength: f32, reach_mm: f32) -> Pull {
+    Pull { offset: Vec3::new(x_mm * 1e-3, y_mm * 1e-3, 0.0), strength, reach: reach_mm * 1e-3 }
+}
+
+const fn also(bone: SkinBone, echoes: &'static [Pull]) -> SkinBone {
+    SkinBone { echoes, ..bone }
+}
+
 const fn bone(name: &'static str, at: &'static [(usize, f32)], follows: &'static [(usize, f32)], reach: f32) -> SkinBone {
-    SkinBone { name, has_sides: true, at, offset: Vec3::ZERO, follows, reach, zone: Zone::Open, turns_with_jaw: false, gain: [1.0; 3] }
+    SkinBone {
+        name,
+        has_sides: true,
+        at,
+        offset: Vec3::ZERO,
+        follows,
+        reach,
+        echoes: &[],
+        zone: Zone::Open,
+        turns_with_jaw: false,
+        gain: [1.0; 3],
+    }
 }
 
 const fn upper_lip(bone: SkinBone) -> SkinBone {
@@ -45,6 +76,10 @@ const fn lower_lip(bone: SkinBone) -> SkinBone {
     SkinBone { zone: Zone::LowerLip, turns_with_jaw: true, ..bone }
 }
 
+const fn stronger(bone: SkinBone, gain: [f32; 3]) -> SkinBone {
+    SkinBone { gain, ..bone }
+}
+
 const fn midline(bone: SkinBone) -> SkinBone {
     SkinBone { has_sides: false, ..bone }
 }
@@ -53,18 +88,28 @@ const fn moved(bone: SkinBone, x: f32, y: f32, z: f32) -> SkinBone {
     SkinBone { offset: Vec3::new(x, y, z), ..bone }
 }
 
+/// Trackers hardly see a smile of ours that is as wide as the performer's: MakeHuman's lips are fuller than most. Found by
+/// measuring a tracker's readings of renders against its readings of performers.
+const CORNER_GAIN: [f32; 3] = [1.45, 1.45, 1.2];
+const UPPER_LIP_GAIN: [f32; 3] = [1.2, 1.6, 1.0];
+
+/// The forehead's muscle draws the skin up to the hair line.
+const FRONTALIS: &[Pull] = &[pull(0.0, 20.0, 0.80, 34.0), pull(0.0, 38.0, 0.55, 34.0)];
+/// The ring muscle of the eye lifts the cheek and folds the skin beside the outer corner.
+const CROWS_FEET: &[Pull] = &[pull(21.0, 24.0, 0.95, 30.0)];
+
 const SKIN_BONES: [SkinBone; 16] = [
-    bone("brow_inner", &[(22, 0.7), (23, 0.3)], &[(22, 0.7), (23, 0.3)], 0.052),
-    bone("brow_mid", &[(23, 0.5), (24, 0.5)], &[(23, 0.5), (24, 0.5)], 0.050),
-    bone("brow_outer", &[(24, 0.35), (25, 0.65)], &[(24, 0.35), (25, 0.65)], 0.048),
+    also(bone("brow_inner", &[(22, 0.7), (23, 0.3)], &[(22, 0.7), (23, 0.3)], 0.052), FRONTALIS),
+    also(bone("brow_mid", &[(23, 0.5), (24, 0.5)], &[(23, 0.5), (24, 0.5)], 0.050), FRONTALIS),
+    also(bone("brow_outer", &[(24, 0.35), (25, 0.65)], &[(24, 0.35), (25, 0.65)], 0.048), FRONTALIS),
     bone("brow_tail", &[(26, 1.0)], &[(25, 0.2), (26, 0.8)], 0.042),
-    moved(bone("cheek", &[(46, 0.6), (47, 0.4)], &[(54, 0.35), (46, 0.25), (55, 0.1)], 0.040), 0.006, -0.024, 0.0),
+    also(moved(bone("cheek", &[(46, 0.6), (47, 0.4)], &[(54, 0.35), (46, 0.25), (55, 0.1)], 0.040), 0.006, -0.024, 0.0), CROWS_FEET),
     moved(bone("nasolabial", &[(35, 0.5), (54, 0.5)], &[(54, 0.5), (35, 0.3)], 0.032), 0.010, 0.002, 0.0),
-    bone("nose_wing", &[(35, 1.0)], &[(35, 0.8), (34, 0.2)], 0.024),
-    midline(upper_lip(bone("lip_upper_mid", &[(51, 1.0)], &[(51, 0.7), (62, 0.3)], 0.026))),
-    upper_lip(bone("lip_upper", &[(52, 1.0)], &[(52, 0.7), (63, 0.3)], 0.025)),
-    upper_lip(bone("lip_upper_outer", &[(53, 1.0)], &[(53, 0.7), (63, 0.15), (54, 0.15)], 0.025)),
-    bone("lip_corner", &[(54, 1.0)], &[(54, 0.8), (64, 0.2)], 0.034),
+    also(bone("nose_wing", &[(35, 1.0)], &[(35, 0.8), (34, 0.2)], 0.024), &[pull(-5.0, 15.0, 1.0, 24.0), pull(-6.0, 28.0, 0.8, 22.0)]),
+    stronger(midline(upper_lip(bone("lip_upper_mid", &[(51, 1.0)], &[(51, 0.7), (62, 0.3)], 0.026))), UPPER_LIP_GAIN),
+    stronger(upper_lip(bone("lip_upper", &[(52, 1.0)], &[(52, 0.7), (63, 0.3)], 0.025)), UPPER_LIP_GAIN),
+    stronger(upper_lip(bone("lip_upper_outer", &[(53, 1.0)], &[(53, 0.7), (63, 0.15), (54, 0.15)], 0.025)), UPPER_LIP_GAIN),
+    stronger(bone("lip_corner", &[(54, 1.0)], &[(54, 0.8), (64, 0.2)], 0.034), CORNER_GAIN),
     lower_lip(bone("lip_lower_outer", &[(55, 1.0)], &[(55, 0.7), (65, 0.15), (54, 0.15)], 0.025)),
     lower_lip(bone("lip_lower", &[(56, 1.0)], &[(56, 0.7), (65, 0.3)], 0.025)),
     midline(lower_lip(bone("lip_lower_mid", &[(57, 1.0)], &[(57, 0.6), (66, 0.4)], 0.026))),
@@ -73,7 +118,10 @@ const SKIN_BONES: [SkinBone; 16] = [
         zone: Zone::LowerLip,
         ..moved(bone("chin", &[(8, 1.0)], &[(8, 0.6), (7, 0.2), (9, 0.2)], 0.034), 0.0, 0.012, 0.0)
     }),
-    midline(bone("glabella", &[(21, 0.5), (22, 0.5)], &[(21, 0.5), (22, 0.5)], 0.024)),
+    also(
+        midline(bone("glabella", &[(21, 0.5), (22, 0.5)], &[(21, 0.5), (22, 0.5)], 0.024)),
+        &[pull(0.0, 22.0, 0.8, 30.0), pull(0.0, -14.0, 0.6, 18.0)],
+    ),
 ];
 
 /// Joints that carry no bone of the extension, in front of all others.
@@ -100,6 +148,8 @@ pub struct Reach {
     pub vertex: u32,
     /// Metres along the skin.
     pub reach: f32,
+    /// Vertices its muscle moves too: `(vertex, strength, metres along the skin)`.
+    pub echoes: Vec<(u32, f32, f32)>,
     /// What it may move.
     pub zone: Zone,
 }
@@ -169,7 +219,8 @@ impl Rig {
         let at: Vec3 = spec.at.iter().map(|&(landmark, share)| places.ibug68[of_side(landmark)] * share).sum();
         let (vertex, point) = on_skin(at + spec.offset * Vec3::new(sign, 1.0, 1.0));
         let name = if spec.has_sides { format!("{}{}", spec.name, SIDES[side].0) } else { spec.name.to_owned() };
-        self.reaches.push(Reach { joint: self.num_joints(), vertex, reach: spec.reach, zone: spec.zone });
+        let echoes = spec.echoes.iter().map(|pull| (on_skin(point + pull.offset * Vec3::new(sign, 1.0, 1.0)).0, pull.strength, pull.reach));
+        self.reaches.push(Reach { joint: self.num_joints(), vertex, reach: spec.reach, echoes: echoes.collect(), zone: spec.zone });
         let landmarks = spec.follows.iter().map(|&(landmark, share)| (of_side(landmark), share)).collect();
         let turns_with = spec.turns_with_jaw.then(|| "jaw".to_owned());
         self.add(name, point, point, Drive::Skin { landmarks }, spec.gain, turns_with);

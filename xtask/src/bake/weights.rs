@@ -6,7 +6,7 @@ use super::bust::Region;
 use super::fit::{self, Mover};
 use super::mesh::Mesh;
 use super::part::Binding;
-use super::rig::{HEAD, ROOT, Rig, Zone};
+use super::rig::{HEAD, ROOT, Reach, Rig, Zone};
 use glam::{Vec3, Vec3Swizzles};
 use rhytid_shared::ARKIT_NAMES;
 
@@ -37,12 +37,15 @@ pub struct Skin<'a> {
     pub lids: [[Vec<f32>; 2]; 2],
 }
 
+/// How much more firmly weights are held to the automatic rig's where an echo speaks.
+const ECHO_HOLD: f32 = 30.0;
+
 /// Weights of every vertex over the joints, summing to one, before they are cut to four.
 pub type Weights = Vec<Vec<(u8, f32)>>;
 
 /// Height, tilted forwards, over which the neck passes from the torso (0) to the head (1), metres.
-const NECK_TILT: f32 = 0.72;
-const NECK_RANGE: [f32; 2] = [-0.125, -0.058];
+const NECK_TILT: f32 = 0.60;
+const NECK_RANGE: [f32; 2] = [-0.152, -0.093];
 
 /// Index of an ARKit shape.
 pub fn shape(name: &str) -> usize {
@@ -85,7 +88,9 @@ pub fn build(skin: &Skin<'_>, rig: &Rig) -> Weights {
             let taken: f32 = fields.iter().map(|field| field[v]).sum::<f32>();
             weights.extend(joints.zip(&fields).map(|(joint, field)| (joint, field[v] * left / taken.max(1.0))));
             left *= (1.0 - taken).max(0.0);
-            let on_head = headness(skin.mesh.positions[v]);
+            // The mouth's cavity reaches down to the neck, but it is the head's.
+            let is_inner = matches!(skin.regions[v], Region::Mouth | Region::Socket);
+            let on_head = if is_inner { 1.0 } else { headness(skin.mesh.positions[v]) };
             weights.push((HEAD, left * on_head));
             weights.push((ROOT, left * (1.0 - on_head)));
             weights.retain(|&(_, weight)| weight > 0.0);
@@ -107,17 +112,21 @@ fn skin_fields(skin: &Skin<'_>, rig: &Rig, graph: &[Vec<(u32, f32)>]) -> Vec<Vec
         }
     };
     let influences = autorig::influences(graph, &features, allows);
+    let echoes: Vec<Vec<f32>> = rig.reaches.iter().enumerate().map(|(j, reach)| echo(graph, reach, |v| allows(j, v))).collect();
     let mut movers: Vec<Mover> =
         rig.reaches.iter().map(|reach| Mover::Skin { vertex: reach.vertex, turns: reach.zone == Zone::LowerLip }).collect();
     movers.push(Mover::Jaw { pivot: skin.jaw_pivot });
     let shapes = fit::fitted_shapes();
     let mut fields = vec![vec![0.0; num_vertices]; movers.len()];
     for v in 0..num_vertices {
-        let raw: Vec<f32> = influences.iter().map(|influence| influence[v]).collect();
+        let raw: Vec<f32> = influences.iter().zip(&echoes).map(|(influence, echo)| influence[v].max(echo[v])).collect();
         let mut prior = autorig::shares(&raw);
+        // The shapes move the forehead less than foreheads move: where an echo speaks, the automatic rig is believed.
+        let echoed = influences.iter().zip(&echoes).map(|(influence, echo)| (echo[v] - influence[v]).max(0.0)).fold(0.0, f32::max);
+        let hold = 1.0 + ECHO_HOLD * echoed;
         let left = 1.0 - prior.iter().sum::<f32>();
         prior.push((skin.jaw[v] * left.max(0.0)).max(if skin.jaw[v] > 0.0 { 1e-6 } else { 0.0 }));
-        for (field, weight) in fields.iter_mut().zip(fit::fit(skin.mesh, &shapes, skin.jaw_open, v, &movers, &prior)) {
+        for (field, weight) in fields.iter_mut().zip(fit::fit(skin.mesh, &shapes, skin.jaw_open, v, &movers, &prior, hold)) {
             field[v] = weight;
         }
     }
@@ -131,6 +140,13 @@ fn skin_fields(skin: &Skin<'_>, rig: &Rig, graph: &[Vec<(u32, f32)>]) -> Vec<Vec
         autorig::smooth(graph, field, 4, is_same);
     }
     fields
+}
+
+/// Influence of a bone's echoes.
+fn echo(graph: &[Vec<(u32, f32)>], reach: &Reach, allows: impl Fn(usize) -> bool) -> Vec<f32> {
+    let features: Vec<Feature> = reach.echoes.iter().map(|&(vertex, _, reach)| Feature { vertex, reach }).collect();
+    let fields = autorig::influences(graph, &features, |_, v| allows(v));
+    (0..graph.len()).map(|v| fields.iter().zip(&reach.echoes).map(|(field, echo)| field[v] * echo.1).fold(0.0, f32::max)).collect()
 }
 
 fn headness(p: Vec3) -> f32 {
