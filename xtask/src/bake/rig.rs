@@ -90,8 +90,8 @@ const fn moved(bone: SkinBone, x: f32, y: f32, z: f32) -> SkinBone {
 
 /// Trackers hardly see a smile of ours that is as wide as the performer's: MakeHuman's lips are fuller than most. Found by
 /// measuring a tracker's readings of renders against its readings of performers.
-const CORNER_GAIN: [f32; 3] = [1.45, 1.45, 1.2];
-const UPPER_LIP_GAIN: [f32; 3] = [1.2, 1.6, 1.0];
+const CORNER_GAIN: [f32; 3] = [1.6, 1.7, 1.3];
+const UPPER_LIP_GAIN: [f32; 3] = [1.2, 1.5, 1.0];
 
 /// The forehead's muscle draws the skin up to the hair line.
 const FRONTALIS: &[Pull] = &[pull(0.0, 20.0, 0.80, 34.0), pull(0.0, 38.0, 0.55, 34.0)];
