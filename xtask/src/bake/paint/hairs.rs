@@ -62,8 +62,9 @@ pub fn draw(atlas: &Atlas, features: &Features) -> Hairs {
                 let flow = flow + Vec3::new(dice.signed(), dice.signed(), dice.signed()) * 0.22;
                 let along = (flow - texel.normal * texel.normal.dot(flow)).normalize_or(texel.tangent);
                 let length = dice.range(kind.length.0, kind.length.1) * lerp(0.6, 1.0, density);
-                let start = Vec2::new(x as f32 + dice.unit(), y as f32 + dice.unit());
                 let Some(step) = in_texels(along, steps) else { continue };
+                // Begun anywhere along its length: strokes end at seams, and no side of one shall be the barer.
+                let start = Vec2::new(x as f32 + dice.unit(), y as f32 + dice.unit()) - step * length * dice.unit();
                 let stroke = Stroke {
                     start,
                     run: step * length,
@@ -94,6 +95,9 @@ impl Hairs {
         let num_steps = (run.length() * 1.5).ceil().clamp(1.0, 200.0) as usize;
         // Where a hair is narrower than a texel it covers that much less of it.
         let (spread, share) = (half_width.max(0.5), (2.0 * half_width).min(1.0));
+        // Strokes overlap themselves from step to step, so the larger cover counts; between strokes some adds up, all the
+        // more where a texel holds many hairs.
+        let adding = lerp(0.55, 0.16, share);
         for i in 0..=num_steps {
             let t = i as f32 / num_steps as f32;
             let p = start + run * t;
@@ -109,9 +113,8 @@ impl Hairs {
                     let cover = strength * share * thin * smoothstep(spread + 0.5, spread - 0.5, away);
                     let index = y as usize * size + x as usize;
                     if cover > 0.0 {
-                        // Strokes overlap themselves from step to step: the larger counts, a little adds up between strokes.
                         let old = self.cover[index];
-                        self.cover[index] = old.max(cover).max(1.0 - (1.0 - old) * (1.0 - 0.16 * cover));
+                        self.cover[index] = old.max(cover).max(1.0 - (1.0 - old) * (1.0 - adding * cover));
                         self.tone[index] = lerp(self.tone[index], tone, cover);
                     }
                 }

@@ -67,7 +67,7 @@ pub fn paint(atlas: &Atlas, features: &Features, openness: &Openness) -> Result<
 /// Of the skin, perceptual (glTF): oily along the middle of the face, matt on the cheeks. Tuned by eye.
 fn roughness(texel: &Texel, marks: &Marks) -> f32 {
     let uneven = 0.035 * fractal(texel.place / 6.0, 3, 301) + 0.02 * fractal(texel.place / 1.4, 2, 302);
-    let oily = marks.nose.max(0.65 * marks.forehead).max(0.4 * marks.chin);
+    let oily = marks.nose.max(0.40 * marks.forehead).max(0.4 * marks.chin);
     let mut roughness = lerp(0.60, 0.47, oily) + uneven;
     roughness = lerp(roughness, 0.52, marks.upper_lid * 0.6);
     roughness = lerp(roughness, 0.40 + uneven, marks.lip);

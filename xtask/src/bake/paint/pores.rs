@@ -27,6 +27,8 @@ struct Grain {
     fold: f32,
     /// Height of soft unevenness, mm.
     lumps: f32,
+    /// Under dense hair, where pores do not show.
+    is_hidden: bool,
 }
 
 /// Paints the base slope map.
@@ -62,11 +64,16 @@ fn grain(features: &Features, texel: &Texel, marks: &Marks) -> Grain {
         pull: pull * lerp(0.30, 0.12, coarse),
         fold: 0.07 * marks.lip,
         lumps: bare * lerp(0.045, 0.075, marks.chin.max(marks.neck * 0.6)),
+        is_hidden: marks.hair > 0.98,
     }
 }
 
 impl Grain {
     fn height(&self, p: Vec3) -> f32 {
+        let lumps = self.lumps * fractal(p / 2.6, 2, 206);
+        if self.is_hidden {
+            return lumps;
+        }
         let stretched = p - self.pull * p.dot(self.pull) / self.pull.length();
         let pores = cells(stretched / self.period, 201);
         let radius = lerp(0.20, 0.40, (pores.id & 255) as f32 / 255.0);
@@ -74,7 +81,7 @@ impl Grain {
         let warp = Vec3::new(noise(p / 1.7, 202), noise(p / 1.7, 203), noise(p / 1.7, 204)) * 0.35;
         let net = cells((stretched + warp) / (self.period * 0.78), 205);
         let crease = smoothstep(0.22, 0.0, net.second - net.first);
-        let mut height = -self.pore * pit - self.crease * crease + self.lumps * fractal(p / 2.6, 2, 206);
+        let mut height = -self.pore * pit - self.crease * crease + lumps;
         if self.fold > 0.0 {
             let fold = noise(Vec3::new((p.x + 0.7 * noise(p / 2.6, 207)) / 0.95, p.y / 8.0, 0.5), 208);
             let fine = noise(Vec3::new((p.x + 0.4 * noise(p / 1.3, 209)) / 0.45, p.y / 4.0, 1.5), 210);

@@ -82,6 +82,10 @@ fn color(features: &Features, texel: &Texel, marks: &Marks, moles: &[(Vec3, f32,
 
 fn pigment(features: &Features, p: Vec3, marks: &Marks, moles: &[(Vec3, f32, f32)]) -> Pigment {
     let blotch = fractal(p / 19.0, 3, 1);
+    if marks.hair > 0.98 {
+        // Under hair nobody sees more.
+        return Pigment { melanin: 0.0, blood: 0.095 * blotch };
+    }
     let mottle = fractal(p / 5.5, 3, 2);
     let grain = fractal(p / 1.3, 2, 3);
     let mut melanin = 0.055 * fractal(p / 33.0, 2, 4) + 0.06 * mottle + 0.045 * grain;
