@@ -4,6 +4,7 @@
 //! turn follow from their rotation, coefficients of poses that do not move a bone are 0, members of a group share theirs.
 
 mod codes;
+mod kriging;
 mod layout;
 mod quantise;
 mod range_coder;
@@ -29,11 +30,11 @@ use range_coder::{Reader, Writer};
 ///         varint lateness    zigzag: captured - (key's captured + distance * key's interval), µs
 /// then the body, range-coded (`range_coder`), as differences: a key's from rest, a delta's from its key packet:
 ///         3 numbers a bone that does not turn by itself: displacement from rest, steps of 25 µm, within ±2047,
-///           less 3/4 of the difference of the nearest bone before it in the character's order (x mirrored across the face)
+///           less what the bones before it and the slope of the face let expect (`kriging`)
 ///         1 rotation a bone that turns by itself: bit "another component is left out"; if so 2 bits which;
 ///           3 numbers, the components left (12 bits mid-tread over ±1/√2)
 ///         1 number a coefficient slot, 0 to 255, pose by pose: groups in their order, then bones in theirs,
-///           each only where the pose moves the bone or a member
+///           each only where the pose moves the bone or a member; less the projection of the bones just read
 ///         1 number a wrinkle zone, 0 to 255
 ///         52 numbers of expression weights, 0 to 255, in ARKit's order, only with flag 4
 ///         the head: 1 rotation, 3 numbers of position, 16 bits over ±0.3 m
@@ -106,6 +107,9 @@ pub struct Encoder {
     key: Option<Key>,
     /// Length of the last key packet, bytes.
     key_length: usize,
+    /// The shortest delta since then, and how many bytes more all others took together.
+    shortest_delta: usize,
+    excess: usize,
     /// Capture time of the frame before, for the interval.
     last_captured: Option<u64>,
 }
@@ -115,7 +119,7 @@ impl Encoder {
     pub fn new(layout: impl Into<PacketLayout>) -> Self {
         let layout = layout.into();
         let rest = Codes::at_rest(&layout);
-        Self { codes: rest.clone(), rest, layout, key: None, key_length: 0, last_captured: None }
+        Self { codes: rest.clone(), rest, layout, key: None, key_length: 0, shortest_delta: usize::MAX, excess: 0, last_captured: None }
     }
 
     /// Writes `frame` into `out`, which is emptied first. Panics where the frame's arrays are not of the character's lengths.
@@ -151,8 +155,12 @@ impl Encoder {
         let mut writer = Writer::new(out);
         self.codes.transfer(&key.codes, false, &self.layout, &mut writer).expect("quantised codes are in their range");
         writer.finish();
-        // A key packet that costs little more makes the deltas behind it smaller.
-        out.len() * 5 < self.key_length * 4
+        // Deltas grow as the face moves away from its key packet. Once they have cost as much more as a new key packet costs,
+        // that is sent ("rent or buy": never more than twice what the best choice in hindsight costs).
+        let length = out.len();
+        self.shortest_delta = self.shortest_delta.min(length);
+        self.excess += length - self.shortest_delta;
+        self.excess + length < self.key_length.max(self.shortest_delta + 1)
     }
 
     fn encode_key(&mut self, frame: &FaceFrame, out: &mut Vec<u8>) {
@@ -170,6 +178,7 @@ impl Encoder {
         self.codes.transfer(&self.rest, true, &self.layout, &mut writer).expect("quantised codes are in their range");
         writer.finish();
         self.key_length = out.len();
+        (self.shortest_delta, self.excess) = (usize::MAX, 0);
         let codes = match self.key.take() {
             Some(key) => key.codes,
             None => self.rest.clone(),

@@ -1,10 +1,11 @@
 //! One frame as integer codes, and how codes are written as differences.
 
 use super::PacketError;
-use super::layout::PacketLayout;
+use super::layout::{BonePlace, PacketLayout, Slot, Turning};
 use super::quantise::{HEAD_MAX, POINT_MAX, POINT_STEP, SmallestThree, head_code, head_value, point_code, unit_code};
 use super::range_coder::{Coder, Model};
 use crate::face::FaceFrame;
+use crate::limits::MAX_BONES;
 use crate::names::NUM_ARKIT_SHAPES;
 use glam::Vec3;
 
@@ -68,8 +69,8 @@ impl Codes {
         assert_eq!(frame.influences.len(), layout.num_poses * n, "influences of a face frame");
         self.face = frame.face;
         self.has_shapes = frame.shapes.is_some();
-        for (code, moving) in self.points.iter_mut().zip(&layout.moving) {
-            *code = (frame.points[moving.bone] - layout.rest[moving.bone]).to_array().map(point_code);
+        for (code, &bone) in self.points.iter_mut().zip(&layout.moving) {
+            *code = (frame.points[bone] - layout.rest[bone]).to_array().map(point_code);
         }
         for (code, turning) in self.turns.iter_mut().zip(&layout.turning) {
             *code = Rotation::new(frame.rotations[turning.bone]);
@@ -94,15 +95,12 @@ impl Codes {
         frame.rotations.resize(n, glam::Quat::IDENTITY);
         frame.influences.clear();
         frame.influences.resize(layout.num_poses * n, 0.0);
-        for (code, moving) in self.points.iter().zip(&layout.moving) {
-            frame.points[moving.bone] = layout.rest[moving.bone] + Vec3::from(code.map(|code| code as f32 * POINT_STEP));
+        for (code, &bone) in self.points.iter().zip(&layout.moving) {
+            frame.points[bone] = layout.rest[bone] + displacement(code);
         }
         for (code, turning) in self.turns.iter().zip(&layout.turning) {
-            let rotation = code.rotation();
-            frame.rotations[turning.bone] = rotation;
-            let rest = layout.rest[turning.bone];
-            // Without a turn it is at rest exactly, which rounding would not quite give.
-            frame.points[turning.bone] = if *code == Rotation::IDENTITY { rest } else { turning.pivot + rotation * (rest - turning.pivot) };
+            frame.rotations[turning.bone] = code.rotation();
+            frame.points[turning.bone] = turned(code, turning, layout);
         }
         for &(bone, leader) in &layout.followers {
             frame.rotations[bone] = frame.rotations[leader];
@@ -123,15 +121,12 @@ impl Codes {
     /// Codes that leave their range are an error.
     pub fn transfer(&mut self, base: &Self, is_key: bool, layout: &PacketLayout, coder: &mut impl Coder) -> Result<(), PacketError> {
         self.transfer_points(base, is_key, layout, coder)?;
-        let mut turns = Numbers::expecting(if is_key { 4 } else { 3 });
+        let mut turns = [Numbers::expecting(if is_key { 5 } else { 4 }), Numbers::rare(), Numbers::rare()];
         let mut dropped = Model::expecting(DROPPED_IS_SAME);
         for (code, base) in self.turns.iter_mut().zip(&base.turns) {
             transfer_rotation(code, base, &mut turns, &mut dropped, coder)?;
         }
-        let mut influences = Numbers::expecting(if is_key { 3 } else { 2 });
-        for (code, base) in self.influences.iter_mut().zip(&base.influences) {
-            transfer_code(code, *base, 0..=255, &mut influences, coder)?;
-        }
+        self.transfer_influences(base, layout, coder)?;
         let mut zones = Numbers::expecting(3);
         for (code, base) in self.zones.iter_mut().zip(&base.zones) {
             transfer_code(code, *base, 0..=255, &mut zones, coder)?;
@@ -144,7 +139,7 @@ impl Codes {
         } else {
             self.shapes = [0; NUM_ARKIT_SHAPES];
         }
-        let mut head = Numbers::expecting(5);
+        let mut head = [Numbers::expecting(5); 3];
         transfer_rotation(&mut self.head_rotation, &base.head_rotation, &mut head, &mut dropped, coder)?;
         let mut head = Numbers::expecting(8);
         for (code, base) in self.head_position.iter_mut().zip(&base.head_position) {
@@ -153,24 +148,76 @@ impl Codes {
         Ok(())
     }
 
-    /// Bones move with their neighbours: a bone's difference is expected to be that of the nearest bone before it.
+    /// A bone is expected to move with the bones before it and, in z, to slide along the face.
     fn transfer_points(&mut self, base: &Self, is_key: bool, layout: &PacketLayout, coder: &mut impl Coder) -> Result<(), PacketError> {
         let mut axes = [Numbers::expecting(if is_key { 5 } else { 4 }); 3];
-        for (i, moving) in layout.moving.iter().enumerate() {
+        let mut seen = [[0.0; MAX_BONES]; 3];
+        for i in 0..layout.moving.len() {
+            let slope = slope_at(base.points[i], layout.slopes[i]);
+            let mut slide = 0.0;
             for axis in 0..3 {
-                let neighbour = match moving.neighbour {
-                    None => 0,
-                    Some(neighbour) => {
-                        let difference = self.points[neighbour.moving][axis] - base.points[neighbour.moving][axis];
-                        if neighbour.is_mirrored && axis == 0 { -difference } else { difference }
-                    }
-                };
-                let expected = (base.points[i][axis] + neighbour * 3 / 4).clamp(-POINT_MAX, POINT_MAX);
-                transfer_code(&mut self.points[i][axis], expected, -POINT_MAX..=POINT_MAX, &mut axes[axis], coder)?;
+                let field = if axis == 0 { &layout.sideways } else { &layout.upright };
+                let expected = field.expect(i, &seen[axis][..i]);
+                let from = if axis == 2 { slide } else { 0.0 };
+                // The cast saturates; both ends round the same bits.
+                let guess = base.points[i][axis].saturating_add((expected + from).round() as i32).clamp(-POINT_MAX, POINT_MAX);
+                transfer_code(&mut self.points[i][axis], guess, -POINT_MAX..=POINT_MAX, &mut axes[axis], coder)?;
+                let moved = (self.points[i][axis] - base.points[i][axis]) as f32;
+                if axis < 2 {
+                    slide += slope[axis] * moved;
+                }
+                seen[axis][i] = field.whiten(i, moved - from, expected);
             }
         }
         Ok(())
     }
+
+    /// Coefficients are expected to be what the bones just sent make them ([D09] 5.1, 5.2), as far as they were that in the base.
+    fn transfer_influences(&mut self, base: &Self, layout: &PacketLayout, coder: &mut impl Coder) -> Result<(), PacketError> {
+        let mut numbers = Numbers::rare();
+        for (i, slot) in layout.slots.iter().enumerate() {
+            let off = base.influences[i] - base.projected(slot, layout);
+            // One code is rounding, more is another way of evaluating.
+            let off = if off.abs() > 1 { off } else { 0 };
+            let expected = (self.projected(slot, layout) + off).clamp(0, 255);
+            transfer_code(&mut self.influences[i], expected, 0..=255, &mut numbers, coder)?;
+        }
+        Ok(())
+    }
+
+    /// The coefficient that these bones make in `slot`: the mean of their projections on the way to the pose.
+    fn projected(&self, slot: &Slot, layout: &PacketLayout) -> i32 {
+        let mut sum = 0.0;
+        for member in &slot.moved {
+            let moved = match member.place {
+                BonePlace::Moving(i) => displacement(&self.points[i]),
+                BonePlace::Turning(i) => turned(&self.turns[i], &layout.turning[i], layout) - layout.rest[layout.turning[i].bone],
+            };
+            sum += moved.dot(member.direction).clamp(0.0, 1.0);
+        }
+        unit_code(sum / slot.moved.len() as f32)
+    }
+}
+
+/// A displacement from its codes, metres.
+fn displacement(codes: &[i32; 3]) -> Vec3 {
+    Vec3::from(codes.map(|code| code as f32 * POINT_STEP))
+}
+
+/// The evaluated point of a bone that turns by itself.
+fn turned(code: &Rotation, turning: &Turning, layout: &PacketLayout) -> Vec3 {
+    let rest = layout.rest[turning.bone];
+    // Without a turn it is at rest exactly, which rounding would not quite give.
+    if *code == Rotation::IDENTITY { rest } else { turning.pivot + code.rotation() * (rest - turning.pivot) }
+}
+
+/// The face's slope at a bone: from the rest positions around it, corrected by where the base has the bone.
+fn slope_at(base: [i32; 3], rest: [f32; 2]) -> [f32; 2] {
+    // Squared steps: bones nearer to rest than 0.25 mm say little about the slope.
+    const DOUBT: f32 = 100.0;
+    let [x, y, z] = base.map(|code| code as f32);
+    let off = (z - rest[0] * x - rest[1] * y) / (x * x + y * y + DOUBT);
+    [rest[0] + off * x, rest[1] + off * y]
 }
 
 /// 250 in 256: rotations leave out the same component as in the base, unless they turn by more than 90 degrees.
@@ -179,7 +226,7 @@ const DROPPED_IS_SAME: u8 = 250;
 fn transfer_rotation(
     code: &mut Rotation,
     base: &Rotation,
-    numbers: &mut Numbers,
+    numbers: &mut [Numbers; 3],
     dropped: &mut Model,
     coder: &mut impl Coder,
 ) -> Result<(), PacketError> {
@@ -194,7 +241,7 @@ fn transfer_rotation(
     for i in 0..3 {
         // Where another component is left out, the base says nothing.
         let expected = if is_same { base.codes[i] } else { 0 };
-        transfer_code(&mut code.codes[i], expected, -Rotation::MAX..=Rotation::MAX, numbers, coder)?;
+        transfer_code(&mut code.codes[i], expected, -Rotation::MAX..=Rotation::MAX, &mut numbers[i], coder)?;
     }
     Ok(())
 }
@@ -233,6 +280,11 @@ impl Numbers {
         // Chance that a length goes on, in 1/256 of ending with a 0; tuned on real feeds.
         const ENDS: [u8; 8] = [20, 30, 50, 90, 120, 140, 170, 200];
         Self { ends: ENDS.map(Model::expecting), second: Model::expecting(140), mean: length * 16 }
+    }
+
+    /// Numbers that are mostly 0.
+    fn rare() -> Self {
+        Self { ends: [Model::expecting(225); 8], second: Model::expecting(140), mean: 0 }
     }
 
     fn transfer(&mut self, value: i32, coder: &mut impl Coder) -> i32 {

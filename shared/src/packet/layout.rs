@@ -1,6 +1,7 @@
 //! What both ends must know of a character to agree on what a packet carries and what goes without saying.
 
 use super::PacketError;
+use super::kriging::{Expectation, Symmetry, slopes};
 use crate::character::Character;
 use crate::face::{FaceFrame, HeadPose};
 use crate::limits::{MAX_BONES, MAX_POSES, MAX_ZONES};
@@ -16,30 +17,18 @@ pub struct PacketLayout {
     pub(super) num_poses: usize,
     pub(super) num_zones: usize,
     /// Bones whose displacement is sent.
-    pub(super) moving: Vec<Moving>,
+    pub(super) moving: Vec<usize>,
+    /// What is expected of their x, and of their y and z.
+    pub(super) sideways: Expectation,
+    pub(super) upright: Expectation,
+    /// How z changes with x and y where they slide along the face.
+    pub(super) slopes: Vec<[f32; 2]>,
     /// Bones whose rotation is sent; their point follows from it.
     pub(super) turning: Vec<Turning>,
     /// `(bone, the turning bone whose rotation it copies)`.
     pub(super) followers: Vec<(usize, usize)>,
     /// Coefficients that can differ from 0 and from each other.
     pub(super) slots: Vec<Slot>,
-}
-
-/// A bone whose displacement is sent.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Moving {
-    pub bone: usize,
-    /// The bone before it that probably moves alike.
-    pub neighbour: Option<Neighbour>,
-}
-
-/// A bone that probably moves like another.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Neighbour {
-    /// Index into `moving`.
-    pub moving: usize,
-    /// It is on the other side of the face: x moves the other way.
-    pub is_mirrored: bool,
 }
 
 /// A bone whose rotation is sent.
@@ -55,6 +44,25 @@ pub(super) struct Slot {
     pub pose: usize,
     /// At least one.
     pub bones: Vec<usize>,
+    /// Those of them that the pose moves, at least one.
+    pub moved: Vec<Member>,
+}
+
+/// A bone that a pose moves.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Member {
+    pub place: BonePlace,
+    /// The pose's displacement over its square: its dot product with a displacement is the influence ([D09] 5.1).
+    pub direction: Vec3,
+}
+
+/// Where a bone's codes stand.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum BonePlace {
+    /// Index into `moving`.
+    Moving(usize),
+    /// Index into `turning`.
+    Turning(usize),
 }
 
 /// The parts of a character, wherever they come from.
@@ -62,8 +70,8 @@ struct Parts<'a> {
     rest: Vec<Vec3>,
     pivots: Vec<Option<Vec3>>,
     turns_with: Vec<Option<usize>>,
-    /// For each pose, which bones it moves.
-    moves: Vec<Vec<bool>>,
+    /// For each pose, how it displaces each bone.
+    moves: Vec<Vec<Vec3>>,
     groups: &'a [Vec<usize>],
     num_zones: usize,
 }
@@ -74,7 +82,7 @@ impl From<&Character> for PacketLayout {
         Self::from_parts(Parts {
             pivots: character.bones.iter().map(|bone| bone.pivot()).collect(),
             turns_with: character.bones.iter().map(|bone| bone.turns_with).collect(),
-            moves: character.poses.iter().map(|pose| pose.points.iter().zip(&rest).map(|(point, rest)| point != rest).collect()).collect(),
+            moves: character.poses.iter().map(|pose| pose.points.iter().zip(&rest).map(|(point, rest)| *point - *rest).collect()).collect(),
             rest,
             groups: &character.groups,
             num_zones: 0,
@@ -100,10 +108,13 @@ impl TryFrom<&CharacterHello> for PacketLayout {
         }
         let mut moves = Vec::with_capacity(hello.poses.len());
         for pose in &hello.poses {
-            let mut row = vec![false; n];
+            let mut row = vec![Vec3::ZERO; n];
             for (name, point) in &pose.bones {
                 let bone = find(name)?;
-                row[bone] = Vec3::from(*point) != rest[bone];
+                row[bone] = Vec3::from(*point) - rest[bone];
+                if !row[bone].is_finite() {
+                    return Err(PacketError::Hello("it has a point that is not finite"));
+                }
             }
             moves.push(row);
         }
@@ -116,14 +127,18 @@ impl TryFrom<&CharacterHello> for PacketLayout {
 impl PacketLayout {
     fn from_parts(parts: Parts<'_>) -> Self {
         let n = parts.rest.len();
-        let mut moving: Vec<Moving> = Vec::new();
+        let mut moving = Vec::new();
         let mut turning = Vec::new();
+        let mut places = Vec::with_capacity(n);
         for bone in 0..n {
             match parts.pivots[bone] {
-                Some(pivot) => turning.push(Turning { bone, pivot }),
+                Some(pivot) => {
+                    places.push(BonePlace::Turning(turning.len()));
+                    turning.push(Turning { bone, pivot });
+                }
                 None => {
-                    let neighbour = nearest(&parts.rest, bone, &moving);
-                    moving.push(Moving { bone, neighbour });
+                    places.push(BonePlace::Moving(moving.len()));
+                    moving.push(bone);
                 }
             }
         }
@@ -132,16 +147,28 @@ impl PacketLayout {
         for (pose, moves) in parts.moves.iter().enumerate() {
             let alone = (0..n).filter(|bone| !is_grouped(*bone)).map(|bone| vec![bone]);
             for bones in parts.groups.iter().cloned().chain(alone) {
-                if bones.iter().any(|bone| moves[*bone]) {
-                    slots.push(Slot { pose, bones });
+                let moved: Vec<Member> = bones
+                    .iter()
+                    .filter(|bone| moves[**bone] != Vec3::ZERO)
+                    .map(|bone| Member {
+                        place: places[*bone],
+                        direction: moves[*bone] / moves[*bone].length_squared().max(f32::MIN_POSITIVE),
+                    })
+                    .collect();
+                if !moved.is_empty() {
+                    slots.push(Slot { pose, bones, moved });
                 }
             }
         }
+        let points: Vec<Vec3> = moving.iter().map(|bone| parts.rest[*bone]).collect();
         Self {
             followers: parts.turns_with.iter().enumerate().filter_map(|(bone, leader)| Some((bone, (*leader)?))).collect(),
             rest: parts.rest,
             num_poses: parts.moves.len(),
             num_zones: parts.num_zones,
+            sideways: Expectation::new(&points, Symmetry::Odd),
+            upright: Expectation::new(&points, Symmetry::Even),
+            slopes: slopes(&points),
             moving,
             turning,
             slots,
@@ -163,18 +190,4 @@ impl PacketLayout {
             head: HeadPose::default(),
         }
     }
-}
-
-/// The bone among `before` that is nearest to `bone`, itself or mirrored.
-fn nearest(rest: &[Vec3], bone: usize, before: &[Moving]) -> Option<Neighbour> {
-    let here = rest[bone];
-    let mirrored = Vec3::new(-here.x, here.y, here.z);
-    let candidates = before.iter().enumerate().flat_map(|(moving, other)| {
-        let there = rest[other.bone];
-        [
-            (there.distance_squared(here), Neighbour { moving, is_mirrored: false }),
-            (there.distance_squared(mirrored), Neighbour { moving, is_mirrored: true }),
-        ]
-    });
-    candidates.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, neighbour)| neighbour)
 }
