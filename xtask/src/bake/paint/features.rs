@@ -154,7 +154,7 @@ impl<'a> Features<'a> {
         let (inner, outer) = if side == Side::Left { (42, 45) } else { (39, 36) };
         let (inner, outer) = (self.chart.landmark(inner), self.chart.landmark(outer));
         let across = (texel.place - inner).dot(outer - inner) / (outer - inner).length_squared();
-        let within = smoothstep(-0.22, 0.0, across) * smoothstep(1.18, 1.0, across);
+        let within = smoothstep(-0.22, 0.0, across) * smoothstep(1.07, 0.97, across);
         let ahead = smoothstep(0.15, 0.35, from_centre.z / from_centre.length());
         let level = lerp(inner.y, outer.y, across.clamp(0.0, 1.0));
         let is_upper = smoothstep(-1.0, 1.5, texel.place.y - level);
@@ -163,7 +163,7 @@ impl<'a> Features<'a> {
             * smoothstep(0.2, 1.1, above_ball)
             * within
             * ahead
-            * lerp(0.28, 1.0, is_upper)
+            * lerp(0.28, smoothstep(1.0, 0.78, across), is_upper)
             * (1.0 - marks.socket);
         marks.upper_lid = texel.share(Region::Eyelid) * is_upper;
         marks.eye_corner = bell((texel.place - inner).length(), 2.8);
