@@ -43,7 +43,7 @@ fn shade(in: Varyings, normal: vec3<f32>) -> vec4<f32> {
         let oily = highlight(normal, view, light, roughness * 0.62, F0);
         let dry = highlight(normal, view, light, roughness, F0);
         // Rims outline by their diffuse light; their highlights would look like sweat.
-        specular += arriving * mix(dry, oily, 0.22) * select(1.0, 0.35, i > 1u);
+        specular += arriving * mix(dry, oily, 0.22) * select(1.0, 0.2, i > 1u);
     }
     let n_dot_v = clamp(dot(normal, view), 0.0, 1.0);
     let reflected = reflect(-view, normal);
