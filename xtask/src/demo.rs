@@ -34,7 +34,10 @@ pub fn run() -> Result<()> {
     ensure!(status.success(), "the build failed ({status})");
 
     let bin = target_dir(&root).join("release");
-    let mut server = Running::start("rhytid-server", Command::new(bin.join("rhytid-server")).args(["serve", "--listen", "127.0.0.1:0"]).stdout(Stdio::piped()))?;
+    let mut server = Running::start(
+        "rhytid-server",
+        Command::new(bin.join("rhytid-server")).args(["serve", "--listen", "127.0.0.1:0"]).stdout(Stdio::piped()),
+    )?;
     let url = server.listening_url()?.replacen("http://", "ws://", 1);
     println!("demo: serving at {url}, room demo");
 

@@ -53,10 +53,12 @@ pub fn run() -> Result<()> {
         println!("set-up: {} is missing", need.what);
     }
     let is_allowed = std::env::var_os("RHYTID_NO_INSTALL").is_none_or(|value| value != "1");
-    if is_allowed && is_root() && is_on_path("apt-get") {
-        if let Err(error) = install(&packages) {
-            println!("set-up: {error}");
-        }
+    if is_allowed
+        && is_root()
+        && is_on_path("apt-get")
+        && let Err(error) = install(&packages)
+    {
+        println!("set-up: {error}");
     }
     for need in missing.iter().filter(|need| !(need.is_here)()) {
         println!("set-up: still without {}: {}.", need.what, need.without);
