@@ -1,6 +1,8 @@
 //! The real program watching a small server over real sockets: the window under a virtual display, the film without one,
 //! and what is said where one of them is impossible. What a machine lacks shows as ignored.
 
+#![allow(clippy::result_large_err, reason = "tungstenite's callbacks are declared so")]
+
 use libtest_mimic::{Arguments, Failed, Trial};
 use rhytid_shared::packet::Encoder;
 use rhytid_shared::view::{SUBPROTOCOL, ViewHello, ViewMessage};
@@ -61,7 +63,6 @@ fn serve_one_viewer(seconds: u64) -> String {
 
 fn serve(stream: TcpStream, seconds: u64) {
     let character = Character::from_glb(DEFAULT_CHARACTER_GLB).expect("the default character is whole");
-    #[allow(clippy::result_large_err, reason = "the signature is tungstenite's")]
     let accept = |_: &Request, mut response: Response| {
         response.headers_mut().insert("Sec-WebSocket-Protocol", HeaderValue::from_static(SUBPROTOCOL));
         Ok::<_, ErrorResponse>(response)
@@ -168,7 +169,6 @@ fn film_of_a_server_that_refuses_says_why() -> Result<(), Failed> {
     let address = format!("ws://{}", listener.local_addr()?);
     std::thread::spawn(move || {
         let (stream, _) = listener.accept().expect("the viewer comes");
-        #[allow(clippy::result_large_err, reason = "the signature is tungstenite's")]
         let refuse = |_: &Request, _: Response| {
             let mut response = ErrorResponse::new(None);
             *response.status_mut() = StatusCode::FORBIDDEN;

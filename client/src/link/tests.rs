@@ -1,5 +1,7 @@
 //! The link against a small server of its own, over real sockets.
 
+#![allow(clippy::result_large_err, reason = "tungstenite's callbacks are declared so")]
+
 use super::*;
 use rhytid_shared::packet::{Encoder, PacketLayout};
 use rhytid_shared::view::{BoneHello, CharacterHello, PROTOCOL_VERSION, PoseHello, SUBPROTOCOL, ViewMessage};
@@ -38,7 +40,6 @@ impl TestServer {
         .unwrap()
     }
 
-    #[allow(clippy::result_large_err, reason = "the signature is tungstenite's")]
     fn accept_with(&self, answer: impl FnOnce(&Request, Response) -> Result<Response, ErrorResponse> + Unpin) -> Option<Socket> {
         let (stream, _) = self.listener.accept().unwrap();
         tungstenite::accept_hdr(stream, answer).ok()
