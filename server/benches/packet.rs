@@ -14,11 +14,13 @@ use std::hint::black_box;
 use std::path::{Path, PathBuf};
 
 /// Bytes a frame in other formats, as their specifications and sources give them: UDP payload with all values sent.
-const OTHERS: [(&str, f64); 3] = [("Live Link Face (61 floats)", 312.0), ("OpenSeeFace (66 points and more)", 1785.0), ("VMC (52 OSC messages and bones)", 2524.0)];
+const OTHERS: [(&str, f64); 3] =
+    [("Live Link Face (61 floats)", 312.0), ("OpenSeeFace (66 points and more)", 1785.0), ("VMC (52 OSC messages and bones)", 2524.0)];
 
 fn packets(criterion: &mut Criterion) {
     let (character, _) = load_character(None).expect("the built-in character is good");
-    let path = std::env::var_os("RHYTID_FEED").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/assets/demo.ibug68.jsonl"), PathBuf::from);
+    let path = std::env::var_os("RHYTID_FEED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/assets/demo.ibug68.jsonl"), PathBuf::from);
     let mut feed = Feed::open(&path, &character).expect("the feed is good");
     let mut pipeline = Pipeline::new(character.clone(), &SolveConfig::default(), &feed.hello, 1).expect("the hello is good");
     let (mut tracking, mut packet) = (TrackingFrame::default(), Vec::new());
@@ -31,7 +33,8 @@ fn packets(criterion: &mut Criterion) {
         }
     }
     let mean = |kind: Option<PacketKind>| {
-        let sizes: Vec<usize> = packets.iter().filter(|(k, _)| kind.is_none_or(|kind| kind == *k)).map(|(_, packet)| packet.len()).collect();
+        let sizes: Vec<usize> =
+            packets.iter().filter(|(k, _)| kind.is_none_or(|kind| kind == *k)).map(|(_, packet)| packet.len()).collect();
         (sizes.iter().sum::<usize>() as f64 / sizes.len().max(1) as f64, sizes.len())
     };
     let largest = packets.iter().map(|(_, packet)| packet.len()).max().unwrap_or_default();

@@ -4,8 +4,9 @@ mod solve_fixture;
 
 use glam::{Quat, Vec3};
 use rhytid_server::solve::{SolveConfig, SolveError, Solver};
+use rhytid_shared::character::Corrective;
 use rhytid_shared::layout::{IBUG_FROM_MEDIAPIPE, IBUG_FROM_OPENSEEFACE, IBUG_MIRROR, Layout};
-use rhytid_shared::{Character, FaceFrame, HeadPose, TrackingData, TrackingFrame};
+use rhytid_shared::{ArkitShape, Character, FaceFrame, HeadPose, TrackingData, TrackingFrame};
 use solve_fixture::*;
 use std::sync::Arc;
 
@@ -179,7 +180,7 @@ fn zero_weights_give_the_neutral_and_single_shapes_are_exact() {
     solver.solve(&weight_frame(10.0, &[("mouthSmileLeft", 1.0)]), &mut out).expect("a good frame");
     assert!((influence(&character, &out, "smile", "lip_corner_l") - 1.0).abs() < 1e-5);
     assert_eq!(influence(&character, &out, "smile", "lip_corner_r"), 0.0);
-    assert_eq!(out.shapes.expect("passed on")[rhytid_shared::ArkitShape::from_name("mouthSmileLeft").expect("ARKit's").index()], 1.0);
+    assert_eq!(out.shapes.expect("passed on")[ArkitShape::from_name("mouthSmileLeft").expect("ARKit's").index()], 1.0);
 
     solver.solve(&weight_frame(20.0, &[("eyeBlinkLeft", 1.0)]), &mut out).expect("a good frame");
     let (left, right) = (character.bone_index("lid_upper_l").expect("a lid"), character.bone_index("lid_upper_r").expect("a lid"));
@@ -277,8 +278,71 @@ fn asking_before_the_first_face_is_answered_by_the_first_faces() {
     let mut out = FaceFrame::at_rest(&character);
     solver.calibrate();
     assert!(solver.take_calibrated().is_none());
-    hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 0.0, 0.6);
+    let t = hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 0.0, 0.2);
+    assert!(solver.take_calibrated().is_none(), "one frame makes no neutral");
+    hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, t, 0.4);
+    assert!(solver.take_calibrated().is_some_and(|report| report.requested && report.num_frames > 3));
+}
+
+#[test]
+fn a_neutral_asked_for_while_the_face_is_away_is_taken_from_several_frames() {
+    let character = character();
+    let mut solver = solver(&character, None);
+    let mut out = FaceFrame::at_rest(&character);
+    let t = hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 0.0, 3.0);
+    assert!(solver.take_calibrated().is_some());
+    for frame in 0..30 {
+        solver.solve(&TrackingFrame { t: t + f64::from(frame) / 30.0, data: TrackingData::NoFace }, &mut out).expect("a good frame");
+    }
+    solver.calibrate();
+    assert!(solver.take_calibrated().is_none());
+    hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, t + 5.0, 1.0);
+    let report = solver.take_calibrated().expect("answered once the face is back");
+    assert!(report.requested && report.num_frames > 3, "{report:?}");
+}
+
+#[test]
+fn refinements_of_a_neutral_that_was_asked_for_are_not_told() {
+    let character = character();
+    let mut solver = solver(&character, None);
+    let mut out = FaceFrame::at_rest(&character);
+    let t = hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 0.0, 3.0);
+    solver.calibrate();
     assert!(solver.take_calibrated().is_some_and(|report| report.requested));
+    hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, t, 9.0);
+    assert_eq!(solver.take_calibrated(), None, "nobody asked again");
+}
+
+#[test]
+fn a_long_absence_does_not_use_up_the_looks_at_the_neutral() {
+    let character = character();
+    let mut solver = solver(&character, None);
+    let mut out = FaceFrame::at_rest(&character);
+    let smile = expression([0.0; 2], 0.004, 0.008, 0.0);
+    let t = hold(&mut solver, &mut out, &character, &smile, &View::FRONT, 0.0, 3.0);
+    solver.solve(&TrackingFrame { t, data: TrackingData::NoFace }, &mut out).expect("a good frame");
+    hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 200.0, 20.0);
+    assert!(largest(&out.influences) < 0.05, "the calm face is at rest: {:?}", out.influences);
+}
+
+#[test]
+fn another_performer_who_sits_down_can_ask_for_a_neutral() {
+    let character = character();
+    let mut solver = solver(&character, None);
+    let mut out = FaceFrame::at_rest(&character);
+    let t = hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 0.0, 3.0);
+    assert!(solver.take_calibrated().is_some());
+    // A far longer nose: no pose of the first performer's head fits.
+    let mut other = landmarks();
+    for point in &mut other[28..=35] {
+        point.y *= 1.9;
+    }
+    let t = hold(&mut solver, &mut out, &character, &other, &View::FRONT, t, 3.0);
+    solver.calibrate();
+    let t = hold(&mut solver, &mut out, &character, &other, &View::FRONT, t, 1.5);
+    assert!(solver.take_calibrated().is_some_and(|report| report.requested));
+    hold(&mut solver, &mut out, &character, &other, &View::FRONT, t, 1.0);
+    assert!(largest(&out.influences) < 0.02, "{:?}", out.influences);
 }
 
 #[test]
@@ -526,6 +590,74 @@ fn a_landmark_the_tracker_does_not_believe_stays_where_it_was() {
     }
     assert!(influence(&character, &out, "stretch", "brow_mid_r") < 0.05);
     assert!(influence(&character, &out, "stretch", "brow_mid_l") > 0.8);
+}
+
+#[test]
+fn a_landmark_never_believed_stays_where_the_restored_neutral_has_it() {
+    let character = character();
+    let mut first = solver(&character, None);
+    let mut out = FaceFrame::at_rest(&character);
+    hold(&mut first, &mut out, &character, &landmarks(), &View::FRONT, 0.0, 2.5);
+    let kept = first.calibration().cloned().expect("reached");
+    let mut solver =
+        Solver::with_calibration(character.clone(), &SolveConfig::default(), &hello(Some(Layout::Ibug68), None), kept).expect("fits");
+    let mut confidence = vec![1.0; 68];
+    confidence[17..=26].fill(0.1);
+    let points = see(&landmarks(), character.head_pivot, &View::FRONT);
+    solver.solve(&TrackingFrame { t: 0.0, data: TrackingData::Landmarks { points, confidence } }, &mut out).expect("a good frame");
+    assert!(largest(&out.influences) < 0.02, "{:?}", out.influences);
+}
+
+#[test]
+fn landmarks_not_believed_are_no_part_of_the_neutral() {
+    let character = character();
+    let mut solver = solver(&character, None);
+    let mut out = FaceFrame::at_rest(&character);
+    let points = see(&landmarks(), character.head_pivot, &View::FRONT);
+    let mut stray = points.clone();
+    for point in &mut stray[17..=21] {
+        point[1] += 60.0;
+    }
+    let mut confidence = vec![1.0; 68];
+    confidence[17..=21].fill(0.1);
+    solver.solve(&landmark_frame(0.0, points), &mut out).expect("a good frame");
+    for i in 1..100 {
+        let data = TrackingData::Landmarks { points: stray.clone(), confidence: confidence.clone() };
+        solver.solve(&TrackingFrame { t: f64::from(i) / 30.0, data }, &mut out).expect("a good frame");
+    }
+    let brow = solver.calibration().expect("reached").points[19];
+    assert!((brow[1] - f64::from(landmarks()[19].y)).abs() < 0.002, "{brow:?}");
+}
+
+#[test]
+fn smoothing_of_weights_is_reported() {
+    let character = character();
+    let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(None, None)).expect("a good session");
+    let mut out = FaceFrame::at_rest(&character);
+    for i in 0..3 {
+        solver.solve(&weight_frame(f64::from(i) / 30.0, &[]), &mut out).expect("a good frame");
+    }
+    let delay = solver.added_delay();
+    assert!(delay.mouth > 0.01 && delay.head == 0.0, "{delay:?}");
+}
+
+#[test]
+fn zero_weights_are_exactly_neutral_with_correctives_too() {
+    let mut character = Character::clone(&character());
+    let shape = |name| ArkitShape::from_name(name).expect("a name of ARKit's");
+    let (corner, jaw) = (character.bone_index("lip_corner_l").expect("a bone"), character.bone_index("jaw").expect("a jaw"));
+    character.correctives = vec![Corrective {
+        weights: vec![(shape("jawOpen"), 1.0), (shape("mouthSmileLeft"), 0.7)],
+        bones: vec![(corner, Vec3::new(0.003, -0.004, 0.001)), (jaw, Vec3::new(0.0, -0.012, -0.004))],
+    }];
+    let character = Arc::new(character);
+    let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(None, None)).expect("a good session");
+    let (mut out, rest) = (FaceFrame::at_rest(&character), FaceFrame::at_rest(&character));
+    solver.solve(&weight_frame(0.0, &[]), &mut out).expect("a good frame");
+    assert_eq!((&out.points, &out.rotations, &out.influences), (&rest.points, &rest.rotations, &rest.influences));
+    solver.solve(&weight_frame(1.0, &[("jawOpen", 1.0), ("mouthSmileLeft", 0.7)]), &mut out).expect("a good frame");
+    let moved = out.points[corner] - rest.points[corner];
+    assert!(moved.distance(Vec3::new(0.003, -0.004, 0.001)) < 1e-6, "{moved}");
 }
 
 #[test]

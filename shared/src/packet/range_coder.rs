@@ -175,7 +175,7 @@ mod tests {
         let mut state = 12345u32;
         let mut next = || {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (state >> 16) % one_in == 0
+            (state >> 16).is_multiple_of(one_in)
         };
         (0..count).map(|_| next()).collect()
     }
