@@ -6,9 +6,8 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 /// Passes: each file holds the entry points of one.
-const PASSES: [&str; 10] = ["background", "eye", "hair", "influence", "normals", "plain", "present", "shadow", "skin", "wireframe"];
-/// The `wet` pass and the parts that passes include are listed apart, for tests build their own passes from the latter.
-const MORE_PASSES: [&str; 1] = ["wet"];
+const PASSES: [&str; 11] = ["background", "eye", "hair", "influence", "normals", "plain", "present", "shadow", "skin", "wet", "wireframe"];
+/// Parts that are exported by themselves, too: tests build passes of their own from them.
 const PARTS: [&str; 2] = ["skinning", "wrinkles"];
 /// `//!include NAME` on a line of its own puts `NAME.wgsl` there, once.
 const INCLUDE: &str = "//!include ";
@@ -20,7 +19,7 @@ fn main() {
     println!("cargo::rerun-if-changed=src/wgsl");
     let mut out = String::new();
     let mut layouts = BTreeMap::new();
-    for pass in PASSES.iter().chain(&MORE_PASSES) {
+    for pass in PASSES {
         let source = assemble(&folder, pass);
         let module = check(pass, &source);
         collect_layouts(pass, &module, &mut layouts);
@@ -29,7 +28,7 @@ fn main() {
     for part in PARTS {
         write_source(&mut out, part, &assemble(&folder, part));
     }
-    let names: Vec<String> = PASSES.iter().chain(&MORE_PASSES).map(|pass| format!("{:?}, {}", pass, pass.to_uppercase())).collect();
+    let names: Vec<String> = PASSES.iter().map(|pass| format!("{:?}, {}", pass, pass.to_uppercase())).collect();
     writeln!(out, "/// Every pass by its name.\npub const PASSES: [(&str, &str); {}] = [({})];", names.len(), names.join("), ("))
         .expect("strings grow");
     writeln!(out, "/// Layouts of the uniform blocks and their parts, bytes.\npub mod layout {{").expect("strings grow");
@@ -83,12 +82,11 @@ fn collect_layouts(pass: &str, module: &naga::Module, layouts: &mut BTreeMap<Str
         .filter(|(_, variable)| variable.space == naga::AddressSpace::Uniform)
         .map(|(_, variable)| variable.ty)
         .collect();
-    let mut is_block = wanted.len();
     while let Some(handle) = wanted.pop() {
         let ty = &module.types[handle];
         match &ty.inner {
             naga::TypeInner::Struct { members, span } => {
-                if is_block > 0 && *span > MAX_UNIFORM_BYTES {
+                if *span > MAX_UNIFORM_BYTES {
                     panic!("{pass}.wgsl: {:?} takes {span} bytes, a WebGL2 uniform block holds {MAX_UNIFORM_BYTES}", ty.name);
                 }
                 let name = ty.name.clone().unwrap_or_else(|| panic!("{pass}.wgsl: a uniform struct has no name"));
@@ -117,7 +115,6 @@ fn collect_layouts(pass: &str, module: &naga::Module, layouts: &mut BTreeMap<Str
             naga::TypeInner::Array { base, .. } => wanted.push(*base),
             _ => {}
         }
-        is_block = is_block.min(wanted.len());
     }
 }
 

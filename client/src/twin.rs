@@ -97,6 +97,7 @@ pub fn filmic(light: f32, exposure: f32) -> f32 {
 }
 
 #[cfg(test)]
+#[allow(clippy::excessive_precision, reason = "numbers stand as they were worked out")]
 mod tests {
     use super::*;
     use glam::{Mat3, Quat};

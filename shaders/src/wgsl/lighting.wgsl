@@ -4,10 +4,12 @@
 @group(0) @binding(2) var shadow_sampler: sampler_comparison;
 
 const PI: f32 = 3.14159265;
+// Weights of four taps across the edge of a shadow.
+const TENT: array<f32, 4> = array<f32, 4>(0.125, 0.375, 0.375, 0.125);
 // Highlights brighter than this, before exposure, would only make edges crawl when samples are averaged.
 const BRIGHTEST: f32 = 6.0;
 
-// 1 where the key light arrives, 0 in its shadow. Twenty-five taps, each a bilinear comparison, weighted as a tent.
+// 1 where the key light arrives, 0 in its shadow. Sixteen taps, each a bilinear comparison, weighted as a tent.
 fn key_visibility(world: vec3<f32>, normal: vec3<f32>) -> f32 {
     let texel_metres = frame.eye.w;
     let facing = clamp(dot(normal, frame.lights[0].direction.xyz), 0.0, 1.0);
@@ -17,13 +19,14 @@ fn key_visibility(world: vec3<f32>, normal: vec3<f32>) -> f32 {
     let uv = clip.xy * vec2<f32>(0.5, -0.5) + 0.5;
     let texel = 1.0 / vec2<f32>(textureDimensions(shadow_map));
     var sum = 0.0;
-    for (var y = -2; y <= 2; y += 1) {
-        for (var x = -2; x <= 2; x += 1) {
-            let weight = f32((3 - abs(x)) * (3 - abs(y)));
-            sum += weight * textureSampleCompareLevel(shadow_map, shadow_sampler, uv + vec2<f32>(f32(x), f32(y)) * texel * 1.9, clip.z);
+    for (var y = 0; y < 4; y += 1) {
+        for (var x = 0; x < 4; x += 1) {
+            let weight = TENT[x] * TENT[y];
+            let offset = (vec2<f32>(f32(x), f32(y)) - 1.5) * 2.4;
+            sum += weight * textureSampleCompareLevel(shadow_map, shadow_sampler, uv + offset * texel, clip.z);
         }
     }
-    return sum / 81.0;
+    return sum;
 }
 
 // Light from all round that reaches a diffuse surface.
