@@ -2,15 +2,18 @@
 
 use crate::{setup, workspace_root};
 use anyhow::{Context, Result, ensure};
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// How long a child may take to end after it was asked to.
-const GRACE: Duration = Duration::from_secs(5);
+/// How long a child may take to end after it was asked to: a film has its contact sheet to draw.
+const GRACE: Duration = Duration::from_secs(30);
+/// How long a viewer may take to open its adapter and to join the room; the session starts without it then.
+const VIEWER_TIMEOUT: Duration = Duration::from_secs(60);
 /// How long the server may take to load the character and listen.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -57,6 +60,10 @@ pub fn run() -> Result<()> {
     }
     // The viewer first, so that it sees the session from its first frame.
     let mut viewer = Running::start("rhytid-client", &mut viewer)?;
+    let deadline = Instant::now() + VIEWER_TIMEOUT;
+    while !is_stopped.load(Ordering::SeqCst) && viewer.child.try_wait()?.is_none() && Instant::now() < deadline && !is_watched(&url) {
+        std::thread::sleep(Duration::from_millis(100));
+    }
     let mut sender = Running::start("rhytid-server send", &mut sender)?;
 
     let outcome = loop {
@@ -80,6 +87,23 @@ pub fn run() -> Result<()> {
         running.stop()?;
     }
     outcome
+}
+
+/// True once somebody watches the room, by the server's own list of rooms.
+fn is_watched(url: &str) -> bool {
+    let Some(address) = url.strip_prefix("ws://") else { return false };
+    let rooms = || -> std::io::Result<String> {
+        let mut socket = TcpStream::connect(address)?;
+        socket.set_read_timeout(Some(Duration::from_secs(2)))?;
+        write!(socket, "GET /api/rooms HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;
+        let mut answer = String::new();
+        socket.read_to_string(&mut answer)?;
+        Ok(answer)
+    };
+    let Ok(answer) = rooms() else { return false };
+    let Some((_, body)) = answer.split_once("\r\n\r\n") else { return false };
+    let Ok(rooms) = serde_json::from_str::<serde_json::Value>(body) else { return false };
+    rooms["rooms"].as_array().is_some_and(|rooms| rooms.iter().any(|room| room["viewers"].as_u64() > Some(0)))
 }
 
 /// Where Cargo puts what it builds.
