@@ -1,4 +1,4 @@
-//! What one frame costs, as a whole and stage by stage: 68 points to 31 bones and 4 poses.
+//! What one frame costs on the default character, as a whole and stage by stage: 68 points to some 40 bones and 4 poses.
 //! Budget: 10 microseconds a frame on one core; aim: 4.
 
 #![allow(missing_docs, reason = "criterion's macros")]
@@ -6,14 +6,19 @@
 #[path = "../tests/solve_fixture/mod.rs"]
 mod solve_fixture;
 
-use criterion::{Criterion, criterion_group, criterion_main};
+use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use glam::{DVec2, DVec3, Vec3};
 use rhytid_server::solve::stages::{Evaluator, OneEuroBank, Pose, Regression, lift, refine};
 use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::layout::{IBUG_STABLE, Layout};
-use rhytid_shared::{FaceFrame, TrackingFrame};
-use solve_fixture::{IMAGE, View, character, expression, feed, hello, landmarks, see};
+use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame, TrackingFrame};
+use solve_fixture::{IMAGE, View, expression, feed, hello, landmarks, see, weight_frame};
 use std::hint::black_box;
+use std::sync::Arc;
+
+fn character() -> Arc<Character> {
+    Arc::new(Character::from_glb(DEFAULT_CHARACTER_GLB).expect("the built-in character is sound"))
+}
 
 /// Frames of a performance, over and over with time going on.
 struct Endless {
@@ -42,6 +47,36 @@ fn whole(criterion: &mut Criterion) {
         solver.solve(frames.next(), &mut out).expect("a good frame");
     }
     criterion.bench_function("whole frame", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
+
+    let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(None, None)).expect("a good session");
+    let named: Vec<(&str, f32)> = ["jawOpen", "mouthSmileLeft", "browInnerUp", "eyeBlinkLeft"].map(|name| (name, 0.4)).into();
+    let mut frames = Endless { frames: vec![weight_frame(0.0, &named), weight_frame(0.0, &[])], next: 0, t: 0.0 };
+    criterion.bench_function("whole frame of weights", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
+}
+
+/// The budget of a new neutral is 5 ms.
+fn calibration(criterion: &mut Criterion) {
+    let character = character();
+    let frames = feed(&character, 601);
+    let after = |num: usize| {
+        let mut solver =
+            Solver::new(character.clone(), &SolveConfig::default(), &hello(Some(Layout::Ibug68), None)).expect("a good session");
+        let mut out = FaceFrame::at_rest(&character);
+        for frame in &frames[..num] {
+            solver.solve(frame, &mut out).expect("a good frame");
+        }
+        (solver, out)
+    };
+    let mut group = criterion.benchmark_group("calibration");
+    group.sample_size(30);
+    group.bench_function("asked for", |bencher| {
+        bencher.iter_batched_ref(|| after(100), |(solver, _)| solver.calibrate(), BatchSize::PerIteration)
+    });
+    // The frame of the look at 20 s, with as many frames in hand as a look works on.
+    group.bench_function("of the whole session, with depth", |bencher| {
+        bencher.iter_batched_ref(|| after(600), |(solver, out)| solver.solve(&frames[600], out), BatchSize::PerIteration);
+    });
+    group.finish();
 }
 
 fn stages(criterion: &mut Criterion) {
@@ -80,16 +115,17 @@ fn stages(criterion: &mut Criterion) {
     let targets: Vec<DVec3> = (0..68).filter(|i| matches!(i, 7..=9 | 17..=36 | 39 | 42 | 45 | 48..=59)).map(|i| model[i] * 1.1).collect();
     criterion.bench_function("train the regression", |bencher| bencher.iter(|| Regression::fit(black_box(&sources), &targets, 0.0)));
     let map = Regression::fit(&sources, &targets, 0.0).expect("a face");
-    criterion.bench_function("regression at 30 points", |bencher| {
-        bencher.iter(|| sources.iter().take(30).map(|p| map.value(black_box(*p))).sum::<Vec3>());
+    // As many as the default character's bones use.
+    criterion.bench_function("regression at 39 points", |bencher| {
+        bencher.iter(|| sources.iter().cycle().take(39).map(|p| map.value(black_box(*p))).sum::<Vec3>());
     });
 
     let evaluator = Evaluator::new(&character);
     let points: Vec<Vec3> = character.bones.iter().map(|bone| bone.rest + Vec3::splat(0.002)).collect();
     let mut influences = vec![0.0; character.num_poses() * character.num_bones()];
     criterion
-        .bench_function("evaluate 31 bones x 4 poses", |bencher| bencher.iter(|| evaluator.evaluate(black_box(&points), &mut influences)));
+        .bench_function("evaluate all bones x 4 poses", |bencher| bencher.iter(|| evaluator.evaluate(black_box(&points), &mut influences)));
 }
 
-criterion_group!(benches, whole, stages);
+criterion_group!(benches, whole, calibration, stages);
 criterion_main!(benches);

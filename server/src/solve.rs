@@ -288,10 +288,14 @@ impl Solver {
         self.report.take()
     }
 
-    /// Delay the smoothing adds at present; zero for senders of weights or bones.
+    /// Delay the smoothing adds at present; weights share one filter, and a sender's own head and bones pass as they are.
     pub fn added_delay(&self) -> DelayReport {
         match (&self.landmarks, self.last_source) {
             (Some(landmarks), Some(Source::Landmarks) | None) => landmarks.added_delay(),
+            (_, Some(Source::Weights)) => {
+                let delay = self.weights.added_delay();
+                DelayReport { brows: delay, eyelids: delay, mouth: delay, head: 0.0 }
+            }
             _ => DelayReport::default(),
         }
     }

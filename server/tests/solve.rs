@@ -646,10 +646,13 @@ fn zero_weights_are_exactly_neutral_with_correctives_too() {
     let mut character = Character::clone(&character());
     let shape = |name| ArkitShape::from_name(name).expect("a name of ARKit's");
     let (corner, jaw) = (character.bone_index("lip_corner_l").expect("a bone"), character.bone_index("jaw").expect("a jaw"));
-    character.correctives = vec![Corrective {
-        weights: vec![(shape("jawOpen"), 1.0), (shape("mouthSmileLeft"), 0.7)],
-        bones: vec![(corner, Vec3::new(0.003, -0.004, 0.001)), (jaw, Vec3::new(0.0, -0.012, -0.004))],
-    }];
+    // Two examples that nearly coincide: their system is regularised.
+    character.correctives = [0.7, 0.70002]
+        .map(|smile| Corrective {
+            weights: vec![(shape("jawOpen"), 1.0), (shape("mouthSmileLeft"), smile)],
+            bones: vec![(corner, Vec3::new(0.003, -0.004, 0.001)), (jaw, Vec3::new(0.0, -0.012, -0.004))],
+        })
+        .into();
     let character = Arc::new(character);
     let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(None, None)).expect("a good session");
     let (mut out, rest) = (FaceFrame::at_rest(&character), FaceFrame::at_rest(&character));
@@ -657,7 +660,7 @@ fn zero_weights_are_exactly_neutral_with_correctives_too() {
     assert_eq!((&out.points, &out.rotations, &out.influences), (&rest.points, &rest.rotations, &rest.influences));
     solver.solve(&weight_frame(1.0, &[("jawOpen", 1.0), ("mouthSmileLeft", 0.7)]), &mut out).expect("a good frame");
     let moved = out.points[corner] - rest.points[corner];
-    assert!(moved.distance(Vec3::new(0.003, -0.004, 0.001)) < 1e-6, "{moved}");
+    assert!(moved.distance(Vec3::new(0.003, -0.004, 0.001)) < 1e-5, "{moved}");
 }
 
 #[test]

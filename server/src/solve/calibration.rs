@@ -21,7 +21,9 @@ const HISTORY: usize = 256;
 const RECENT: usize = 16;
 /// Frames a look works on: with these it takes 2 ms.
 const MOST_WORKED: usize = 96;
-/// When the session is looked at again, seconds after the first face.
+/// A neutral that is asked for is taken from at least this many frames; it waits for them.
+const FEWEST_ASKED: usize = 3;
+/// When the session is looked at again, seconds of a face seen.
 const LOOKS: [f64; 5] = [5.0, 10.0, 20.0, 40.0, 80.0];
 
 /// A neutral face as it was calibrated: kept with a session so that a replay is exact.
@@ -141,12 +143,31 @@ pub(super) struct Calibrator {
     previous: Vec<DVec2>,
     previous_t: Option<f64>,
     started_at: Option<f64>,
+    /// Seconds without a face since then.
+    lost_for: f64,
+    /// Time of the last face.
+    seen_t: Option<f64>,
     num_calm: usize,
     num_looks: usize,
     /// Automatic: the neutral is searched for. Otherwise it has been given and only its depth is refined.
     is_automatic: bool,
     has_neutral: bool,
-    wanted_since: Option<f64>,
+    wanted: Option<Wanted>,
+}
+
+/// A neutral that the publisher waits for.
+#[derive(Debug, Clone, Copy)]
+struct Wanted {
+    /// Time of the first face after it was asked for.
+    since: Option<f64>,
+}
+
+/// A neutral that has been reached.
+#[derive(Debug, Clone)]
+pub(super) struct Found {
+    pub(super) calibration: Calibration,
+    /// It is one to tell the publisher of: the first, or one that was asked for. The others refine it.
+    pub(super) is_awaited: bool,
 }
 
 impl Calibrator {
@@ -162,11 +183,13 @@ impl Calibrator {
             previous: vec![DVec2::ZERO; num_points],
             previous_t: None,
             started_at: None,
+            lost_for: 0.0,
+            seen_t: None,
             num_calm: 0,
             num_looks: 0,
             is_automatic: true,
             has_neutral: false,
-            wanted_since: None,
+            wanted: None,
         }
     }
 
@@ -179,6 +202,13 @@ impl Calibrator {
     /// Takes one frame: its rays, the pose they were placed with and the points they became in head space.
     pub(super) fn observe(&mut self, t: f64, rays: &[DVec2], pose: &Pose, points: &[DVec2], unit: f64) {
         self.started_at.get_or_insert(t);
+        if self.previous_t.is_none() {
+            self.lost_for += self.seen_t.map_or(0.0, |seen| t - seen);
+        }
+        self.seen_t = Some(t);
+        if let Some(wanted) = &mut self.wanted {
+            wanted.since.get_or_insert(t);
+        }
         let speed = self.previous_t.map(|previous| {
             let sum: f64 = points.iter().zip(&self.previous).map(|(now, before)| (*now - *before).length_squared()).sum();
             (sum / points.len() as f64).sqrt() / ((t - previous) * unit)
@@ -221,35 +251,36 @@ impl Calibrator {
     /// The publisher asks for the neutral now. Given at once where frames of the last moments are there, else as soon as
     /// they are.
     pub(super) fn request(&mut self, t: f64, shape: &mut Shape<'_>) -> Option<Calibration> {
-        let found = self.look_back(t, shape);
+        let found = self.look_back(t, FEWEST_ASKED, shape);
         if found.is_none() {
-            self.wanted_since = Some(t);
+            self.wanted = Some(Wanted { since: None });
         }
         found
     }
 
-    fn look_back(&mut self, t: f64, shape: &mut Shape<'_>) -> Option<Calibration> {
+    fn look_back(&mut self, t: f64, fewest: usize, shape: &mut Shape<'_>) -> Option<Calibration> {
         let since = t - self.config.look_back;
         let samples = &self.recent.samples;
         let recent: Vec<usize> = (0..samples.len()).filter(|&i| samples[i].t >= since).collect();
-        if recent.is_empty() {
+        if recent.len() < fewest {
             return None;
         }
         let mut calibration = median_of(&self.recent, &calmest_half(samples, recent), shape, t)?;
         calibration.requested = true;
         (self.is_automatic, self.has_neutral) = (false, true);
-        self.wanted_since = None;
+        self.wanted = None;
         Some(calibration)
     }
 
     /// A neutral that has just been reached. Call once a frame, after [`Self::observe`]. `current` is the neutral in use.
-    pub(super) fn poll(&mut self, t: f64, shape: &mut Shape<'_>, current: &Calibration) -> Option<Calibration> {
-        if let Some(since) = self.wanted_since
+    pub(super) fn poll(&mut self, t: f64, shape: &mut Shape<'_>, current: &Calibration) -> Option<Found> {
+        if let Some(Wanted { since: Some(since) }) = self.wanted
             && t - since >= self.config.look_back
         {
-            return self.look_back(t, shape);
+            // A slow tracker has no more frames than these.
+            return self.look_back(t, 1, shape).map(|calibration| Found { calibration, is_awaited: true });
         }
-        let elapsed = t - self.started_at?;
+        let elapsed = t - self.started_at? - self.lost_for;
         let is_due = if self.has_neutral {
             LOOKS.get(self.num_looks).is_some_and(|look| elapsed >= *look)
         } else {
@@ -258,6 +289,7 @@ impl Calibrator {
         if !is_due {
             return None;
         }
+        let is_awaited = !self.has_neutral;
         self.num_looks += usize::from(self.has_neutral);
         // Strong expressions would pass for depth.
         let relaxed = least_strained_half(&self.history.samples, (0..self.history.samples.len()).collect());
@@ -266,18 +298,13 @@ impl Calibrator {
         depth::refine(shape, worked);
         self.has_neutral = true;
         if !self.is_automatic {
-            return Some(with_depth(current, shape, t));
+            return Some(Found { calibration: with_depth(current, shape, t), is_awaited });
         }
         let samples = &self.history.samples;
         let calm: Vec<usize> = (0..samples.len()).filter(|&i| samples[i].speed < self.config.calm_speed).collect();
         let calm = if calm.len() >= self.config.min_frames { calm } else { calmest_half(samples, (0..samples.len()).collect()) };
         let chosen = if self.strain.is_some() { least_strained_half(samples, calm) } else { calm };
-        median_of(&self.history, &chosen, shape, t)
-    }
-
-    /// True until the session has been looked at again: what has been reached is its first neutral.
-    pub(super) fn is_first(&self) -> bool {
-        self.num_looks == 0
+        median_of(&self.history, &chosen, shape, t).map(|calibration| Found { calibration, is_awaited })
     }
 }
 

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub struct SolveConfig {
     /// The sender's picture is mirrored: left and right are swapped at ingest (landmarks and weights, not bones).
     pub mirror: bool,
-    /// Ridge of the regression from landmarks to the character, in squared units of its unit-RMS coordinates; 0 interpolates.
+    /// Ridge of the regression from landmarks to the character, in units of its unit-RMS coordinates; 0 interpolates.
     pub ridge: f64,
     /// Largest root-mean-square reprojection error of an accepted head pose, as a fraction of the interocular distance.
     pub max_reprojection: f64,

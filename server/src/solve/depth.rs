@@ -24,6 +24,9 @@ pub(super) struct Shape<'a> {
     pub(super) believed_spread: &'a [f64],
     /// The point on the other side of the face.
     pub(super) mirror: &'a [usize],
+    /// Each iris and the corners of its eye, whose depth it takes: eyes that stay on the screen turn against the head, and
+    /// that would pass for depth.
+    pub(super) irises: &'a [(usize, (usize, usize))],
     pub(super) stable: &'a [(usize, f64)],
     /// True where the stable points are enough for a pose in perspective, and so for depths.
     pub(super) has_perspective: bool,
@@ -71,6 +74,9 @@ pub(super) fn refine<'a>(shape: &mut Shape<'_>, frames: impl Iterator<Item = (Po
             let step = -slide / (spread + num * believed * believed);
             let most = FARTHEST * shape.unit;
             shape.model[i].z = (shape.model[i].z + step).clamp(shape.prior[i] - most, shape.prior[i] + most);
+        }
+        for &(iris, (outer, inner)) in shape.irises {
+            shape.model[iris].z = 0.5 * (shape.model[outer].z + shape.model[inner].z);
         }
     }
 }
@@ -122,6 +128,7 @@ mod tests {
             prior: &prior,
             believed_spread: &believed_spread,
             mirror: &mirror,
+            irises: &[],
             stable: &stable,
             has_perspective: true,
             unit: 0.09,

@@ -74,7 +74,6 @@ fn multiply(a: DVec2, b: DVec2) -> DVec2 {
 }
 
 /// Where a pose shows the point.
-#[cfg(test)]
 pub(super) fn project(rotation: &DMat3, translation: DVec3, point: DVec3) -> DVec2 {
     let p = *rotation * point + translation;
     DVec2::new(p.x, p.y) / p.z

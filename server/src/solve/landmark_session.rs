@@ -1,7 +1,7 @@
 //! One performer's landmarks through a session: head pose, neutral, smoothing, retargeting.
 
 use super::DelayReport;
-use super::calibration::{self, Calibration, Calibrator, ibug_strain};
+use super::calibration::{self, Calibration, Calibrator, Found, ibug_strain};
 use super::config::SolveConfig;
 use super::depth::Shape;
 use super::easing::FaceState;
@@ -47,6 +47,8 @@ pub(super) struct LandmarkSession {
     /// The character's depths, and how far a head must turn for others to be believed.
     prior: Vec<f64>,
     believed_spread: Vec<f64>,
+    /// Each iris and the corners of its eye.
+    irises: Vec<(usize, (usize, usize))>,
     /// Points that place the head in this frame.
     placing: Vec<(usize, f64)>,
     pose: Option<Pose>,
@@ -79,8 +81,10 @@ impl LandmarkSession {
         let unit = f64::from(character.interocular());
         let mut model = points.model.clone();
         let mut groups = points.groups.clone();
+        let mut irises = Vec::new();
         if points.irises.is_some() {
             for eye in [RIGHT_EYE, LEFT_EYE] {
+                irises.push((model.len(), eye.corners));
                 model.push((points.model[eye.corners.0] + points.model[eye.corners.1]) * 0.5);
                 groups.push(Group::Eyelids);
             }
@@ -103,6 +107,7 @@ impl LandmarkSession {
             pivot: character.head_pivot.as_dvec3(),
             unit,
             observation: Observation { rays: Vec::with_capacity(num), is_sure: Vec::with_capacity(num) },
+            irises,
             placing: Vec::with_capacity(points.len()),
             pose: None,
             last_t: None,
@@ -131,7 +136,11 @@ impl LandmarkSession {
             return Err(SolveError::BadCalibration { problem: "has no points, expected a neutral of landmarks".to_owned() });
         }
         self.calibrator.stop();
-        self.adopt(character, calibration)
+        self.adopt(character, calibration)?;
+        for (lifted, model) in self.lifted.iter_mut().zip(&self.model) {
+            *lifted = model.truncate();
+        }
+        Ok(())
     }
 
     pub(super) fn num_points(&self) -> usize {
@@ -150,7 +159,7 @@ impl LandmarkSession {
         self.adopt(character, found).is_ok()
     }
 
-    fn poll(&mut self, t: f64) -> Option<Calibration> {
+    fn poll(&mut self, t: f64) -> Option<Found> {
         let current = self.calibration.take()?;
         let (calibrator, mut shape) = self.parts();
         let found = calibrator.poll(t, &mut shape, &current);
@@ -165,6 +174,7 @@ impl LandmarkSession {
             prior: &self.prior,
             believed_spread: &self.believed_spread,
             mirror: &self.points.mirror,
+            irises: &self.irises,
             stable: &self.points.stable,
             has_perspective: self.points.has_perspective,
             unit: self.unit,
@@ -199,6 +209,7 @@ impl LandmarkSession {
         self.camera.observe(&self.layout, &self.points, landmarks, confidence, &mut self.observation)?;
         let fit = self.place(t)?;
         let (pose, refused_since) = self.judge(t, fit);
+        let is_refused = refused_since.is_some_and(|since| t - since < LONGEST_REFUSAL);
         self.lift(&pose);
         let is_first = self.retarget.is_none();
         if is_first {
@@ -208,12 +219,11 @@ impl LandmarkSession {
         let dt = self.last_t.map_or(f64::INFINITY, |last| t - last);
         (self.pose, self.refused_since, self.last_t) = (Some(pose), refused_since, Some(t));
         let mut solved = Solved { is_new_neutral: false, is_to_report: false };
-        if refused_since.is_none() {
+        if !is_refused {
             self.calibrator.observe(t, &self.observation.rays, &pose, &self.lifted, self.unit);
             if let Some(found) = self.poll(t) {
-                solved.is_to_report = found.requested || self.calibrator.is_first();
-                solved.is_new_neutral = self.adopt(character, found).is_ok();
-                solved.is_to_report &= solved.is_new_neutral;
+                solved.is_new_neutral = self.adopt(character, found.calibration).is_ok();
+                solved.is_to_report = found.is_awaited && solved.is_new_neutral;
                 // The performer's head has another shape now: look at the frame again.
                 if let Ok(fit) = self.place(t) {
                     self.pose = Some(fit.pose);
@@ -231,6 +241,11 @@ impl LandmarkSession {
         Ok(solved)
     }
 
+    /// The pose of the frame before, unless it is long ago.
+    fn recent_pose(&self, t: f64) -> Option<Pose> {
+        self.pose.filter(|_| self.last_t.is_some_and(|last| t - last <= LONGEST_GAP))
+    }
+
     /// The head pose that fits this frame best.
     fn place(&mut self, t: f64) -> Result<Fit, SolveError> {
         let rays = &self.observation.rays;
@@ -244,8 +259,7 @@ impl LandmarkSession {
             let pose = head_pose::frontal_pose(&self.model, rays, &self.placing)?;
             return Ok(Fit { pose, error: 0.0 });
         }
-        let is_recent = self.last_t.is_some_and(|last| t - last <= LONGEST_GAP);
-        let guess = self.pose.filter(|_| is_recent);
+        let guess = self.recent_pose(t);
         let fit = head_pose::refine(guess, &self.model, rays, &self.placing, self.unit)?;
         if guess.is_some() && fit.error > self.config.max_reprojection {
             // The last pose may have led into a blind alley.
@@ -256,9 +270,9 @@ impl LandmarkSession {
     }
 
     /// Refuses a pose that fits badly in favour of the last one, for a while. Gives the pose to use and since when the
-    /// tracker's have been refused. Until the performer's own proportions are known everything fits badly.
+    /// tracker's have been refused.
     fn judge(&self, t: f64, fit: Fit) -> (Pose, Option<f64>) {
-        match self.pose {
+        match self.recent_pose(t) {
             Some(last) if fit.error > self.config.max_reprojection => {
                 let since = self.refused_since.unwrap_or(t);
                 if t - since < LONGEST_REFUSAL { (last, Some(since)) } else { (fit.pose, Some(since)) }
@@ -274,6 +288,9 @@ impl LandmarkSession {
             if self.observation.is_sure[i] || is_first {
                 let point = head_pose::lift(&matrix, pose.translation, self.observation.rays[i], self.model[i].z);
                 *lifted = DVec2::new(point.x, point.y);
+            } else {
+                // What is not believed shall not come back through a neutral either.
+                self.observation.rays[i] = head_pose::project(&matrix, pose.translation, lifted.extend(self.model[i].z));
             }
         }
     }

@@ -56,6 +56,11 @@ impl WeightSession {
         Some(&self.neutral)
     }
 
+    /// Delay that the smoothing adds at present, seconds.
+    pub(super) fn added_delay(&self) -> f64 {
+        self.bank.delay()
+    }
+
     pub(super) fn solve(&mut self, t: f64, weights: &Weights, state: &mut FaceState) -> Result<(), SolveError> {
         if let Some(index) = weights.iter().position(|weight| !weight.is_finite()) {
             return Err(SolveError::Value { field: "weights", index, got: weights[index], expected: "0 to 1.2" });

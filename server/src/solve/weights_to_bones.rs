@@ -170,6 +170,8 @@ struct Correctives {
     centres: Vec<f32>,
     /// `-1 / (2 sigma^2)`.
     falloff: f64,
+    /// Each bell's value at neutral.
+    at_neutral: Vec<f64>,
     /// `(bone, m amplitudes)`.
     amplitudes: Vec<(usize, Vec<Vec3>)>,
 }
@@ -231,7 +233,11 @@ impl Correctives {
                 (bone, (0..centres.len()).map(at).collect())
             })
             .collect();
-        Some(Self { shapes, centres: centres.concat(), falloff, amplitudes })
+        let at_neutral = centres
+            .iter()
+            .map(|centre| libm::exp(centre.iter().map(|&at| f64::from(0.0 - at) * f64::from(0.0 - at)).sum::<f64>() * falloff))
+            .collect();
+        Some(Self { shapes, centres: centres.concat(), falloff, at_neutral, amplitudes })
     }
 
     fn add(&self, weights: &Weights, motions: &mut [Vec3]) {
@@ -241,7 +247,8 @@ impl Correctives {
                 let d = f64::from(weights[shape] - at);
                 square += d * d;
             }
-            let bell = libm::exp(square * self.falloff) as f32;
+            // What it gives at neutral, zero but for rounding and the ridge, is taken off: neutral is exact.
+            let bell = (libm::exp(square * self.falloff) - self.at_neutral[m]) as f32;
             for (bone, amplitudes) in &self.amplitudes {
                 motions[*bone] += amplitudes[m] * bell;
             }
