@@ -1,5 +1,7 @@
 //! Facts about the program itself: its first line, its end, its errors, its memory.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
+
 use std::io::{BufRead, BufReader, Read};
 use std::net::TcpStream;
 use std::path::PathBuf;

@@ -1,5 +1,7 @@
 //! What real tracker data costs on the wire, and that the same feed gives the same packets.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
+
 use rhytid_server::feed::{Feed, FeedItem};
 use rhytid_server::pipeline::Pipeline;
 use rhytid_server::{load_character, solve::SolveConfig};

@@ -1,5 +1,7 @@
 //! The service over real sockets: a server in this process, blocking clients in threads.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
+
 mod service {
     pub mod bad_input;
     pub mod harness;

@@ -62,7 +62,7 @@ impl Server {
     }
 
     /// A WebSocket to `path`, or the answer that refused it.
-    pub fn connect(&self, path: &str, headers: &[(&'static str, &str)]) -> Result<Client, Response<Option<Vec<u8>>>> {
+    pub fn connect(&self, path: &str, headers: &[(&'static str, &str)]) -> Result<Client, Box<Response<Option<Vec<u8>>>>> {
         let stream = TcpStream::connect(self.address).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         stream.set_nodelay(true).unwrap();
@@ -75,7 +75,7 @@ impl Server {
                 socket,
                 protocol: answer.headers().get("sec-websocket-protocol").map(|value| value.to_str().unwrap().to_owned()),
             }),
-            Err(HandshakeError::Failure(tungstenite::Error::Http(answer))) => Err(*answer),
+            Err(HandshakeError::Failure(tungstenite::Error::Http(answer))) => Err(answer),
             Err(other) => panic!("the handshake failed: {other}"),
         }
     }

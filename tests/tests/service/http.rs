@@ -109,7 +109,7 @@ fn subprotocols_are_chosen_or_refused() {
         assert_eq!(server.connect(view, &[("Sec-WebSocket-Protocol", offer)]).unwrap().protocol.as_deref(), Some("rhytid.v1"), "{offer}");
     }
     for offer in ["chat", "rhytid.v2", "rhytid.v11, RHYTID.V1"] {
-        let (status, body) = body_of(server.connect(view, &[("Sec-WebSocket-Protocol", offer)]).err().unwrap());
+        let (status, body) = body_of(*server.connect(view, &[("Sec-WebSocket-Protocol", offer)]).err().unwrap());
         assert_eq!(status, 400, "{offer}");
         assert!(body.contains("unknown_subprotocol") && body.contains("expected rhytid.v1"), "{body}");
     }
@@ -123,13 +123,13 @@ fn bad_addresses_are_refused() {
     let server = Server::start();
     let long = format!("/v1/rooms/{}/view", "a".repeat(65));
     for path in ["/v1/rooms/a.b/view", "/v1/rooms/a%20b/publish", "/v1/rooms/%C3%A4/view", long.as_str()] {
-        let (status, body) = body_of(server.connect(path, &[]).err().unwrap());
+        let (status, body) = body_of(*server.connect(path, &[]).err().unwrap());
         assert_eq!(status, 400, "{path}");
         assert!(body.contains("bad_room_name") && body.contains("1 to 64 characters"), "{body}");
     }
-    let (status, body) = body_of(server.connect("/v1/rooms/demo/view?format=xml", &[]).err().unwrap());
+    let (status, body) = body_of(*server.connect("/v1/rooms/demo/view?format=xml", &[]).err().unwrap());
     assert!(status == 400 && body.contains("unknown_format"), "{body}");
-    let (status, body) = body_of(server.connect("/v2/rooms/demo/view", &[]).err().unwrap());
+    let (status, body) = body_of(*server.connect("/v2/rooms/demo/view", &[]).err().unwrap());
     assert!(status == 404 && body.contains("not_found"), "{body}");
 }
 
@@ -145,7 +145,7 @@ fn pages_of_other_sites_are_kept_out() {
         assert!(server.connect(view, &[("Origin", origin)]).is_ok(), "{origin}");
     }
     for origin in ["https://evil.example", "null", "http://127.0.0.1:1", "https://studio.example.evil.example"] {
-        let (status, body) = body_of(server.connect(view, &[("Origin", origin)]).err().unwrap());
+        let (status, body) = body_of(*server.connect(view, &[("Origin", origin)]).err().unwrap());
         assert_eq!(status, 403, "{origin}");
         assert!(body.contains("forbidden_origin") && body.contains(origin), "{body}");
     }
