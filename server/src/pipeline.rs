@@ -1,7 +1,7 @@
 //! One publish session's way from tracking frames to packets: the solve, then the encoder. No clock, no I/O: the packets
 //! depend on the feed alone, so the same feed gives the same bytes at any speed.
 
-use crate::solve::{CalibrationReport, SolveConfig, SolveError, Solver};
+use crate::solve::{CalibrationReport, DelayReport, SolveConfig, SolveError, Solver};
 use rhytid_shared::packet::{Encoder, PacketKind};
 use rhytid_shared::{Character, FaceFrame, PublishHello, TrackingFrame};
 use std::sync::Arc;
@@ -39,8 +39,6 @@ impl Pipeline {
         self.solver.solve(frame, &mut self.face)?;
         self.face.session = self.session;
         self.face.seq = self.num_frames;
-        // Checked by the reader: seconds from 0 to 1e10.
-        self.face.captured_at_micros = (frame.t * 1e6).round() as u64;
         self.num_frames = self.num_frames.wrapping_add(1);
         Ok(())
     }
@@ -58,6 +56,11 @@ impl Pipeline {
     /// A neutral that has been reached since the last call.
     pub fn take_calibrated(&mut self) -> Option<CalibrationReport> {
         self.solver.take_calibrated()
+    }
+
+    /// What the smoothing adds now.
+    pub fn added_delay(&self) -> DelayReport {
+        self.solver.added_delay()
     }
 
     /// The frame last solved.

@@ -5,6 +5,7 @@ use crate::pipeline::Pipeline;
 use crate::room::{Publishing, RoomError};
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, close, farewell, send, send_json};
+use crate::solve::DelayReport;
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
 use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
@@ -39,6 +40,8 @@ enum Answer<'a> {
         frames: usize,
         /// True where the publisher asked for it.
         requested: bool,
+        /// Delay the smoothing adds at present, seconds by group.
+        added_delay: DelayReport,
     },
 }
 
@@ -204,7 +207,12 @@ impl<'a> Session<'a> {
             Err(error) => return self.refuse(socket, ErrorMessage::new(error.code, error.message)).await,
         }
         if let Some(report) = self.pipeline.take_calibrated() {
-            let answer = Answer::Calibrated { t: report.t, frames: report.num_frames, requested: report.requested };
+            let answer = Answer::Calibrated {
+                t: report.t,
+                frames: report.num_frames,
+                requested: report.requested,
+                added_delay: self.pipeline.added_delay(),
+            };
             send_json(socket, &answer, write).await?;
         }
         Ok(())

@@ -47,7 +47,7 @@ impl Mouth {
     /// How deep light reaches, in units of `half_width`: hardly to the teeth where the lips meet, behind the tongue's
     /// tip where they stand wide apart. Tuned by eye.
     pub fn light_reach(&self) -> f32 {
-        0.32 + 1.5 * (self.gap / 0.7).min(1.0)
+        0.32 + 1.7 * (self.gap / 0.25).min(1.0)
     }
 }
 

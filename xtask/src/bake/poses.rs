@@ -58,7 +58,7 @@ pub const POSES: [PoseRecipe; 4] = [
         name: "pucker",
         shapes: &[("mouthPucker", 1.15), ("mouthShrugLower", 0.5)],
         bones: &["lip_corner", "lip_upper_outer", "lip_upper", "lip_upper_mid", "lip_lower_outer", "lip_lower", "lip_lower_mid", "chin"],
-        by_hand: &[("lip_corner", mm(-2.0, 0.0, 0.0)), ("chin", mm(0.0, 1.6, 0.3))],
+        by_hand: &[("lip_corner", mm(-2.0, 0.0, 0.0)), ("chin", mm(0.0, 4.2, 0.4))],
     },
 ];
 
