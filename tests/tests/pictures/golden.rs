@@ -5,8 +5,12 @@ use anyhow::{Context, ensure};
 use image::{Rgb, RgbImage, RgbaImage};
 use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
 use rhytid_client::{BlendMode, Camera, DrawSettings, RenderFrame, ViewMode};
-use rhytid_shared::TrackingData;
+use rhytid_server::feed::{Feed, FeedItem};
+use rhytid_server::pipeline::Pipeline;
+use rhytid_server::solve::SolveConfig;
+use rhytid_shared::{Character, FaceFrame, TrackingData, TrackingFrame};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Side of a golden, pixels: small enough to commit, large enough for furrows.
 const SIDE: u32 = 256;
@@ -21,15 +25,28 @@ const MOST_MEAN: f64 = 0.5;
 /// What one golden shows.
 #[derive(Clone)]
 pub struct Shot {
-    pub pose: Option<(&'static str, f32, StillSide)>,
+    pub face: Face,
     pub view: &'static str,
     pub blend: BlendMode,
 }
 
-const REST: Shot = Shot { pose: None, view: "beauty", blend: BlendMode::PartialDerivatives };
+/// The face one golden shows.
+#[derive(Clone, Copy)]
+pub enum Face {
+    Rest,
+    Pose(&'static str, f32, StillSide),
+    /// The frame of the built-in session with this index, solved with all that came before it.
+    Session(usize),
+}
+
+const REST: Shot = Shot { face: Face::Rest, view: "beauty", blend: BlendMode::PartialDerivatives };
 
 const fn posed(pose: &'static str) -> Shot {
-    Shot { pose: Some((pose, 1.0, StillSide::Both)), ..REST }
+    Shot { face: Face::Pose(pose, 1.0, StillSide::Both), ..REST }
+}
+
+const fn in_session(frame: usize) -> Shot {
+    Shot { face: Face::Session(frame), ..REST }
 }
 
 /// Name, golden, and the wrong picture.
@@ -37,7 +54,7 @@ fn shots() -> Vec<(&'static str, Shot, Shot)> {
     let stretch = || posed("stretch");
     let viewed = |view: &'static str| Shot { view, ..stretch() };
     let blended = |blend: BlendMode| Shot { blend, ..stretch() };
-    let raised = |amount: f32, side: StillSide| Shot { pose: Some(("stretch", amount, side)), ..REST };
+    let raised = |amount: f32, side: StillSide| Shot { face: Face::Pose("stretch", amount, side), ..REST };
     vec![
         ("neutral", REST, stretch()),
         ("stretch", stretch(), viewed("bare")),
@@ -53,6 +70,9 @@ fn shots() -> Vec<(&'static str, Shot, Shot)> {
         ("stretch_view_influence", viewed("influence"), viewed("influence:stretch")),
         ("stretch_view_influence_stretch", viewed("influence:stretch"), viewed("influence:compress")),
         ("stretch_view_normals", viewed("normals"), Shot { view: "normals", ..REST }),
+        ("session_brows", in_session(110), in_session(30)),
+        ("session_smile", in_session(200), in_session(110)),
+        ("session_jaw", in_session(350), in_session(200)),
         ("stretch_view_wireframe", viewed("wireframe"), Shot { view: "wireframe", ..REST }),
     ]
 }
@@ -66,16 +86,35 @@ pub fn add(add: &mut Add<'_>) {
 /// Draws a shot from the front, closer than the default so that the face fills the picture.
 pub fn draw(stage: &Stage, shot: &Shot, side: u32) -> anyhow::Result<RgbaImage> {
     let character = &stage.asset.character;
-    let points = match shot.pose {
-        Some((pose, amount, side)) => posed_points(character, pose, amount, side)?,
-        None => Vec::new(),
-    };
-    let frame = RenderFrame::from(&solve_one(character, TrackingData::Bones { points, head: None })?);
+    let posed = |points| -> anyhow::Result<FaceFrame> { Ok(solve_one(character, TrackingData::Bones { points, head: None })?) };
+    let frame = RenderFrame::from(&match shot.face {
+        Face::Rest => posed(Vec::new())?,
+        Face::Pose(pose, amount, side) => posed(posed_points(character, pose, amount, side)?)?,
+        Face::Session(index) => session_frame(character, index)?,
+    });
     let mut camera = Camera::front(character);
     camera.zoom(0.62);
     let settings = DrawSettings { view: ViewMode::parse(shot.view, character)?, blend: shot.blend, ..DrawSettings::new(camera) };
     let mut headless = stage.headless.lock().map_err(|_| anyhow::anyhow!("another test broke the renderer"))?;
     Ok(headless.render([side, side], &settings, &frame)?)
+}
+
+/// Replays the built-in session up to one of its frames.
+fn session_frame(character: &Arc<Character>, index: usize) -> anyhow::Result<FaceFrame> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/assets/demo.ibug68.jsonl");
+    let mut feed = Feed::open(&path, character)?;
+    let mut pipeline = Pipeline::new(Arc::clone(character), &SolveConfig::default(), &feed.hello, 1)?;
+    let mut frame = TrackingFrame { t: 0.0, data: TrackingData::NoFace };
+    let (mut packet, mut num_frames) = (Vec::new(), 0);
+    while let Some(item) = feed.next_frame(&mut frame)? {
+        ensure!(item == FeedItem::Frame, "the built-in session holds frames only");
+        pipeline.frame(&frame, &mut packet)?;
+        if num_frames == index {
+            return Ok(pipeline.face().clone());
+        }
+        num_frames += 1;
+    }
+    anyhow::bail!("the built-in session has {num_frames} frames, none with index {index}")
 }
 
 fn check(stage: &Stage, name: &str, shot: &Shot, wrong: &Shot) -> anyhow::Result<()> {

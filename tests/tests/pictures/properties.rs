@@ -1,6 +1,6 @@
 //! Properties of pictures that hold whatever the character looks like.
 
-use crate::golden::{Shot, draw};
+use crate::golden::{Face, Shot, draw};
 use crate::{Add, Stage};
 use anyhow::ensure;
 use image::RgbaImage;
@@ -9,7 +9,7 @@ use rhytid_client::{BlendMode, Camera, DrawSettings, RenderFrame};
 use rhytid_shared::TrackingData;
 
 const SIDE: u32 = 256;
-const BEAUTY: Shot = Shot { pose: None, view: "beauty", blend: BlendMode::PartialDerivatives };
+const BEAUTY: Shot = Shot { face: Face::Rest, view: "beauty", blend: BlendMode::PartialDerivatives };
 
 pub fn add(add: &mut Add<'_>) {
     add("properties::same_frame_gives_the_same_picture".into(), Box::new(same_frame_gives_the_same_picture));
@@ -33,7 +33,7 @@ fn different(a: &RgbaImage, b: &RgbaImage, codes: u8) -> [usize; 2] {
 }
 
 fn same_frame_gives_the_same_picture(stage: &Stage) -> anyhow::Result<()> {
-    let shot = Shot { pose: Some(("stretch", 1.0, StillSide::Both)), ..BEAUTY };
+    let shot = Shot { face: Face::Pose("stretch", 1.0, StillSide::Both), ..BEAUTY };
     let first = draw(stage, &shot, SIDE)?;
     draw(stage, &BEAUTY, SIDE)?;
     ensure!(first == draw(stage, &shot, SIDE)?, "two drawings of one frame differ");
@@ -43,7 +43,7 @@ fn same_frame_gives_the_same_picture(stage: &Stage) -> anyhow::Result<()> {
 fn rest_has_no_wrinkles(stage: &Stage) -> anyhow::Result<()> {
     let count = different(&draw(stage, &BEAUTY, SIDE)?, &draw(stage, &Shot { view: "bare", ..BEAUTY }, SIDE)?, 2);
     ensure!(count == [0, 0], "beauty and bare differ at rest in {count:?} pixels");
-    let posed = Shot { pose: Some(("stretch", 1.0, StillSide::Both)), ..BEAUTY };
+    let posed = Shot { face: Face::Pose("stretch", 1.0, StillSide::Both), ..BEAUTY };
     let count = different(&draw(stage, &posed, SIDE)?, &draw(stage, &Shot { view: "bare", ..posed }, SIDE)?, 2);
     ensure!(count[0] > 200 && count[1] > 200, "the stretched forehead shows wrinkles in {count:?} pixels only");
     Ok(())
@@ -51,7 +51,7 @@ fn rest_has_no_wrinkles(stage: &Stage) -> anyhow::Result<()> {
 
 /// The character's right is on the left of a picture from the front.
 fn raising_the_right_brow(stage: &Stage) -> anyhow::Result<()> {
-    let raised = Shot { pose: Some(("stretch", 1.0, StillSide::Right)), ..BEAUTY };
+    let raised = Shot { face: Face::Pose("stretch", 1.0, StillSide::Right), ..BEAUTY };
     let wrinkles = different(&draw(stage, &raised, SIDE)?, &draw(stage, &Shot { view: "bare", ..raised }, SIDE)?, 3);
     ensure!(wrinkles[0] > 150, "wrinkles in {wrinkles:?} pixels left and right of the middle");
     ensure!(wrinkles[1] * 8 < wrinkles[0], "wrinkles in {wrinkles:?} pixels left and right of the middle");
@@ -60,7 +60,7 @@ fn raising_the_right_brow(stage: &Stage) -> anyhow::Result<()> {
 
 fn wrinkles_switched_off(stage: &Stage) -> anyhow::Result<()> {
     let character = &stage.asset.character;
-    let shot = Shot { pose: Some(("stretch", 1.0, StillSide::Both)), ..BEAUTY };
+    let shot = Shot { face: Face::Pose("stretch", 1.0, StillSide::Both), ..BEAUTY };
     let bare = draw(stage, &Shot { view: "bare", ..shot.clone() }, SIDE)?;
     let points = rhytid_client::render_cli::posed_points(character, "stretch", 1.0, StillSide::Both)?;
     let frame = RenderFrame::from(&solve_one(character, TrackingData::Bones { points, head: None })?);
