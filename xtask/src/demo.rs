@@ -58,6 +58,10 @@ pub fn run() -> Result<()> {
         println!("demo: no display here, so the session is filmed as it plays, into {}", out.display());
         viewer.args(["film", &url, "--room", "demo", "--seconds", "20", "--out"]).arg(out);
     }
+    if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
+        // Without it the software Vulkan driver prints two lines that look like errors and are none.
+        viewer.env("XDG_RUNTIME_DIR", std::env::temp_dir());
+    }
     // The viewer first, so that it sees the session from its first frame.
     let mut viewer = Running::start("rhytid-client", &mut viewer)?;
     let deadline = Instant::now() + VIEWER_TIMEOUT;
