@@ -33,7 +33,7 @@ fn main() -> ExitCode {
         }
     };
     let mut trials = Vec::new();
-    let mut add = |name: String, check: Box<dyn Fn(&Stage) -> anyhow::Result<()> + Send>| {
+    let mut add = |name: String, check: Check| {
         let on = stage.clone();
         let trial = Trial::test(name, move || match &on {
             Some(stage) => check(stage).map_err(|error| format!("{error:#}").into()),
@@ -47,5 +47,8 @@ fn main() -> ExitCode {
     libtest_mimic::run(&arguments, trials).exit_code()
 }
 
+/// A test's body.
+pub type Check = Box<dyn Fn(&Stage) -> anyhow::Result<()> + Send>;
+
 /// Takes a test's name and its body.
-pub type Add<'a> = dyn FnMut(String, Box<dyn Fn(&Stage) -> anyhow::Result<()> + Send>) + 'a;
+pub type Add<'a> = dyn FnMut(String, Check) + 'a;
