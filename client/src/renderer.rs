@@ -29,7 +29,7 @@ use crate::asset::{CharacterAsset, Palette, Surface};
 use anatomy::{Mouth, eyeballs};
 use glam::{Affine3A, Vec3};
 use layouts::Layouts;
-use pipelines::{Key, Look, Pipelines};
+use pipelines::{Key, Look, Pipelines, Wire};
 use present::{Presenter, Targets};
 use rhytid_shared::Character;
 use shadow::Shadow;
@@ -86,8 +86,8 @@ struct Bounds {
 }
 
 impl Renderer {
-    /// Uploads `asset` and builds the pipelines that end in pictures of `target_format` (any 8-bit RGBA or BGRA format,
-    /// with or without sRGB encoding).
+    /// Uploads `asset` for pictures of `target_format` (any 8-bit RGBA or BGRA format,
+    /// with or without sRGB encoding). Pipelines are built as views first need them.
     pub fn new(device: &wgpu::Device, queue: &wgpu::Queue, asset: &CharacterAsset, target_format: wgpu::TextureFormat) -> Self {
         let layouts = Layouts::new(device);
         let mut uploader = Uploader { device, queue, bytes: 0 };
@@ -109,13 +109,12 @@ impl Renderer {
             layout: &layouts.frame_unlit,
             entries: &[upload::entry(0, frame_block.as_entire_binding())],
         });
-        let pipelines = Pipelines::new(device, &layouts, asset.character.num_poses(), &primitives);
         Self {
             character: Arc::clone(&asset.character),
             palette: asset.palette.clone(),
             bounds: Bounds::new(asset),
             group,
-            pipelines,
+            pipelines: Pipelines::new(&layouts, asset.character.num_poses()),
             background: background::pipeline(device),
             static_bytes: uploader.bytes + shadow.bytes,
             shadow,
@@ -151,7 +150,7 @@ impl Renderer {
         };
         self.write_uniforms(queue, size, settings, frame);
         self.draw_shadow(encoder);
-        self.draw_scene(encoder, &targets, settings);
+        self.draw_scene(device, encoder, &targets, settings);
         self.presenter.draw(encoder, &targets, target);
         self.targets = Some(targets);
     }
@@ -243,7 +242,7 @@ impl Renderer {
         }
     }
 
-    fn draw_scene(&self, encoder: &mut wgpu::CommandEncoder, targets: &Targets, settings: &DrawSettings) {
+    fn draw_scene(&mut self, device: &wgpu::Device, encoder: &mut wgpu::CommandEncoder, targets: &Targets, settings: &DrawSettings) {
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("scene"),
             color_attachments: &[Some(wgpu::RenderPassColorAttachment {
@@ -265,25 +264,25 @@ impl Renderer {
         pass.draw(0..3, 0..1);
         let blend = Look::blend_index(settings.blend);
         match settings.view {
-            ViewMode::Beauty => self.draw_primitives(&mut pass, Look::Wrinkled(blend)),
-            ViewMode::Bare => self.draw_primitives(&mut pass, Look::Bare),
-            ViewMode::Influence(_) => self.draw_primitives(&mut pass, Look::Influence),
-            ViewMode::Normals => self.draw_primitives(&mut pass, Look::Normals(blend)),
-            ViewMode::Wireframe => self.draw_wireframe(&mut pass),
+            ViewMode::Beauty => self.draw_primitives(device, &mut pass, Look::Wrinkled(blend)),
+            ViewMode::Bare => self.draw_primitives(device, &mut pass, Look::Bare),
+            ViewMode::Influence(_) => self.draw_primitives(device, &mut pass, Look::Influence),
+            ViewMode::Normals => self.draw_primitives(device, &mut pass, Look::Normals(blend)),
+            ViewMode::Wireframe => self.draw_wireframe(device, &mut pass),
             ViewMode::Split => {
                 let [width, height] = targets.size;
                 let middle = width / 2;
                 if middle > 0 {
                     pass.set_scissor_rect(0, 0, middle, height);
-                    self.draw_primitives(&mut pass, Look::Wrinkled(blend));
+                    self.draw_primitives(device, &mut pass, Look::Wrinkled(blend));
                 }
                 pass.set_scissor_rect(middle, 0, width - middle, height);
-                self.draw_primitives(&mut pass, Look::Bare);
+                self.draw_primitives(device, &mut pass, Look::Bare);
             }
         }
     }
 
-    fn draw_primitives(&self, pass: &mut wgpu::RenderPass<'_>, look: Look) {
+    fn draw_primitives(&mut self, device: &wgpu::Device, pass: &mut wgpu::RenderPass<'_>, look: Look) {
         pass.set_bind_group(0, &self.frame_group, &[]);
         pass.set_bind_group(1, &self.group.group, &[]);
         let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
@@ -303,25 +302,23 @@ impl Renderer {
                 pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
                 for region in &primitive.regions {
                     let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha, region.poses);
-                    if let Some(pipeline) = self.pipelines.surface(key) {
-                        pass.set_pipeline(pipeline);
-                        pass.draw_indexed(region.indices.clone(), 0, 0..1);
-                    }
+                    pass.set_pipeline(self.pipelines.surface(device, key));
+                    pass.draw_indexed(region.indices.clone(), 0, 0..1);
                 }
             }
         }
     }
 
-    fn draw_wireframe(&self, pass: &mut wgpu::RenderPass<'_>) {
+    fn draw_wireframe(&mut self, device: &wgpu::Device, pass: &mut wgpu::RenderPass<'_>) {
         pass.set_bind_group(0, &self.frame_group_unlit, &[]);
         pass.set_bind_group(1, &self.group.group, &[]);
-        pass.set_pipeline(&self.pipelines.wire_body);
+        pass.set_pipeline(self.pipelines.wire(device, Wire::Body));
         for primitive in &self.primitives {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
         }
-        pass.set_pipeline(&self.pipelines.wire_edges);
+        pass.set_pipeline(self.pipelines.wire(device, Wire::Edges));
         for primitive in &self.primitives {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.edges.slice(..), wgpu::IndexFormat::Uint32);

@@ -1,7 +1,6 @@
 //! Builds pipelines. They never change once built; what changes per frame is an argument.
 
 use super::layouts::Layouts;
-use super::upload::Primitive;
 use super::view::BlendMode;
 use crate::asset::{Alpha, Surface, Vertex};
 use std::collections::BTreeMap;
@@ -65,77 +64,105 @@ impl From<Surface> for ShaderKind {
     }
 }
 
-/// All pipelines that draw a character's triangles.
+/// Pipelines for a character's triangles, each built when it first draws: a character has hundreds of them, a picture
+/// needs a dozen.
 #[derive(Debug)]
 pub struct Pipelines {
+    surface_layout: wgpu::PipelineLayout,
+    geometry_layout: wgpu::PipelineLayout,
+    /// A constant of the shaders.
+    num_poses: usize,
+    modules: BTreeMap<Pass, wgpu::ShaderModule>,
     surfaces: BTreeMap<Key, wgpu::RenderPipeline>,
+    wires: BTreeMap<Wire, wgpu::RenderPipeline>,
+}
+
+/// Source of a module.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Pass {
+    Surface(ShaderKind),
+    Influence,
+    Normals,
+    Wireframe,
+}
+
+/// The two halves of the wireframe view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Wire {
     /// The dark body under the edges.
-    pub wire_body: wgpu::RenderPipeline,
-    pub wire_edges: wgpu::RenderPipeline,
+    Body,
+    Edges,
+}
+
+impl Pass {
+    fn source(self) -> &'static str {
+        match self {
+            Self::Surface(ShaderKind::Skin) => rhytid_shaders::SKIN,
+            Self::Surface(ShaderKind::Eye) => rhytid_shaders::EYE,
+            Self::Surface(ShaderKind::Wet) => rhytid_shaders::WET,
+            Self::Surface(ShaderKind::Plain) => rhytid_shaders::PLAIN,
+            Self::Surface(ShaderKind::Hair) => rhytid_shaders::HAIR,
+            Self::Influence => rhytid_shaders::INFLUENCE,
+            Self::Normals => rhytid_shaders::NORMALS,
+            Self::Wireframe => rhytid_shaders::WIREFRAME,
+        }
+    }
 }
 
 impl Pipelines {
-    /// Pipelines for parts with these surfaces; `num_poses` becomes a constant of the shaders.
-    pub fn new(device: &wgpu::Device, layouts: &Layouts, num_poses: usize, primitives: &[Primitive]) -> Self {
-        let module = |label: &str, source: &str| {
-            device
-                .create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.into()) })
-        };
-        let modules = [
-            (ShaderKind::Skin, module("skin", rhytid_shaders::SKIN)),
-            (ShaderKind::Eye, module("eye", rhytid_shaders::EYE)),
-            (ShaderKind::Wet, module("wet", rhytid_shaders::WET)),
-            (ShaderKind::Plain, module("plain", rhytid_shaders::PLAIN)),
-            (ShaderKind::Hair, module("hair", rhytid_shaders::HAIR)),
-        ];
-        let influence = module("influence", rhytid_shaders::INFLUENCE);
-        let normals = module("normals", rhytid_shaders::NORMALS);
-        let mut surfaces = BTreeMap::new();
-        let blends = 0..BlendMode::ALL.len();
-        let looks: Vec<Look> =
-            [Look::Bare, Look::Influence].into_iter().chain(blends.clone().map(Look::Wrinkled)).chain(blends.map(Look::Normals)).collect();
-        for primitive in primitives {
-            for (look, region) in looks.iter().flat_map(|&look| primitive.regions.iter().map(move |region| (look, region))) {
-                let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha, region.poses);
-                surfaces.entry(key).or_insert_with(|| {
-                    let own = modules.iter().find(|(kind, _)| *kind == key.shader).map_or(&normals, |(_, module)| module);
-                    let (module, vertex_entry, fragment_entry) = match key.look {
-                        Look::Wrinkled(_) => (own, "vs_wrinkled", "fs_wrinkled"),
-                        Look::Bare => (own, "vs_bare", "fs_bare"),
-                        Look::Influence => (&influence, "vs_wrinkled", "fs_influence"),
-                        Look::Normals(_) => (&normals, "vs_wrinkled", "fs_wrinkled"),
-                    };
-                    let blend = match key.look {
-                        Look::Wrinkled(blend) | Look::Normals(blend) => blend,
-                        Look::Bare | Look::Influence => 0,
-                    };
-                    let constants = [("NUM_POSES", num_poses as f64), ("BLEND", blend as f64), ("POSES", f64::from(key.poses))];
-                    scene_pipeline(
-                        device,
-                        &SceneParts {
-                            label: &format!("{:?} {:?}", key.shader, key.look),
-                            layout: &layouts.surface,
-                            module,
-                            vertex_entry,
-                            fragment_entry,
-                            constants: &constants,
-                            topology: wgpu::PrimitiveTopology::TriangleList,
-                            cull_mode: (!key.is_double_sided).then_some(wgpu::Face::Back),
-                            is_film: key.shader == ShaderKind::Wet,
-                            alpha_to_coverage: key.has_coverage,
-                        },
-                    )
-                });
-            }
+    /// None yet; `num_poses` becomes a constant of the shaders.
+    pub fn new(layouts: &Layouts, num_poses: usize) -> Self {
+        Self {
+            surface_layout: layouts.surface.clone(),
+            geometry_layout: layouts.geometry.clone(),
+            num_poses,
+            modules: BTreeMap::new(),
+            surfaces: BTreeMap::new(),
+            wires: BTreeMap::new(),
         }
-        let wireframe = module("wireframe", rhytid_shaders::WIREFRAME);
-        let wire = |vertex_entry, fragment_entry, topology| {
+    }
+
+    /// The pipeline of a part; its first call builds it.
+    pub fn surface(&mut self, device: &wgpu::Device, key: Key) -> &wgpu::RenderPipeline {
+        self.surfaces.entry(key).or_insert_with(|| {
+            let (pass, vertex_entry, fragment_entry, blend) = match key.look {
+                Look::Wrinkled(blend) => (Pass::Surface(key.shader), "vs_wrinkled", "fs_wrinkled", blend),
+                Look::Bare => (Pass::Surface(key.shader), "vs_bare", "fs_bare", 0),
+                Look::Influence => (Pass::Influence, "vs_wrinkled", "fs_influence", 0),
+                Look::Normals(blend) => (Pass::Normals, "vs_wrinkled", "fs_wrinkled", blend),
+            };
+            let constants = [("NUM_POSES", self.num_poses as f64), ("BLEND", blend as f64), ("POSES", f64::from(key.poses))];
+            scene_pipeline(
+                device,
+                &SceneParts {
+                    label: &format!("{:?} {:?}", key.shader, key.look),
+                    layout: &self.surface_layout,
+                    module: module(&mut self.modules, device, pass),
+                    vertex_entry,
+                    fragment_entry,
+                    constants: &constants,
+                    topology: wgpu::PrimitiveTopology::TriangleList,
+                    cull_mode: (!key.is_double_sided).then_some(wgpu::Face::Back),
+                    is_film: key.shader == ShaderKind::Wet,
+                    alpha_to_coverage: key.has_coverage,
+                },
+            )
+        })
+    }
+
+    /// A pipeline of the wireframe view; its first call builds it.
+    pub fn wire(&mut self, device: &wgpu::Device, wire: Wire) -> &wgpu::RenderPipeline {
+        self.wires.entry(wire).or_insert_with(|| {
+            let (vertex_entry, fragment_entry, topology) = match wire {
+                Wire::Body => ("vs_body", "fs_body", wgpu::PrimitiveTopology::TriangleList),
+                Wire::Edges => ("vs_edges", "fs_edges", wgpu::PrimitiveTopology::LineList),
+            };
             scene_pipeline(
                 device,
                 &SceneParts {
                     label: fragment_entry,
-                    layout: &layouts.geometry,
-                    module: &wireframe,
+                    layout: &self.geometry_layout,
+                    module: module(&mut self.modules, device, Pass::Wireframe),
                     vertex_entry,
                     fragment_entry,
                     constants: &[],
@@ -145,16 +172,17 @@ impl Pipelines {
                     alpha_to_coverage: false,
                 },
             )
-        };
-        let wire_body = wire("vs_body", "fs_body", wgpu::PrimitiveTopology::TriangleList);
-        let wire_edges = wire("vs_edges", "fs_edges", wgpu::PrimitiveTopology::LineList);
-        Self { surfaces, wire_body, wire_edges }
+        })
     }
+}
 
-    /// The pipeline of a part.
-    pub fn surface(&self, key: Key) -> Option<&wgpu::RenderPipeline> {
-        self.surfaces.get(&key)
-    }
+fn module<'a>(modules: &'a mut BTreeMap<Pass, wgpu::ShaderModule>, device: &wgpu::Device, pass: Pass) -> &'a wgpu::ShaderModule {
+    modules.entry(pass).or_insert_with(|| {
+        device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(&format!("{pass:?}")),
+            source: wgpu::ShaderSource::Wgsl(pass.source().into()),
+        })
+    })
 }
 
 impl Key {
