@@ -4,15 +4,20 @@ mod anatomy;
 mod background;
 mod camera;
 mod coefficients;
+mod environment;
 mod frame;
+mod fullscreen;
 mod headless;
 mod layouts;
 mod pipelines;
 mod present;
 mod read_back;
 mod regions;
+pub mod scattering;
 mod shadow;
 mod studio;
+mod targets;
+mod tone;
 pub mod uniforms;
 mod upload;
 mod view;
@@ -23,17 +28,21 @@ pub use frame::RenderFrame;
 pub use headless::{AdapterChoice, Headless, RenderError, required_limits};
 pub use pipelines::VERTEX_LAYOUT;
 pub(crate) use read_back::read_back;
-pub use view::{BlendError, BlendMode, ViewError, ViewMode};
+pub use studio::{Studio, StudioError};
+pub use view::{BlendError, BlendMode, Term, ViewError, ViewMode};
 
 use crate::asset::{CharacterAsset, Palette, Surface};
-use anatomy::{Mouth, eyeballs};
+use anatomy::{Mouth, eyeballs, gazes};
 use glam::{Affine3A, Vec3};
 use layouts::Layouts;
 use pipelines::{Key, Look, Pipelines, Wire};
-use present::{Presenter, Targets};
+use present::Presenter;
 use rhytid_shared::Character;
+use scattering::{Lens, Scattering};
 use shadow::Shadow;
 use std::sync::Arc;
+use targets::Targets;
+use tone::{Shown, Tone};
 use upload::{CharacterGroup, Primitive, Uploader};
 
 /// What one drawing shows and how; changes nothing in the renderer.
@@ -49,12 +58,52 @@ pub struct DrawSettings {
     pub wrinkles: bool,
     /// Multiplies the light before the tone map; 1 is the studio's own.
     pub exposure: f32,
+    /// Set-up of lights.
+    pub studio: Studio,
+    /// Turn of the key light about +Y from where the set-up has it, radians.
+    pub key_turn: f32,
+    /// How skin takes light.
+    pub skin: SkinSettings,
+    /// Standard deviation of film grain in the middle tones, 0 to 0.1 of the display's range.
+    pub grain: f32,
+    /// Edges are smoothed after the tone map.
+    pub is_smoothed: bool,
+}
+
+/// How skin takes light. Each is 1 for human skin unless it says otherwise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SkinSettings {
+    /// How far light spreads under the skin; 0 leaves the scattering out.
+    pub scattering: f32,
+    /// How much light shines through thin flesh.
+    pub translucency: f32,
+    /// Strength of highlights.
+    pub gloss: f32,
+    /// Multiplies the roughness of the map.
+    pub roughness: f32,
+}
+
+impl Default for SkinSettings {
+    fn default() -> Self {
+        Self { scattering: 1.0, translucency: 1.0, gloss: 1.0, roughness: 1.0 }
+    }
 }
 
 impl DrawSettings {
     /// Beauty with wrinkles through `camera`.
     pub fn new(camera: Camera) -> Self {
-        Self { camera, view: ViewMode::Beauty, blend: BlendMode::PartialDerivatives, wrinkles: true, exposure: 1.0 }
+        Self {
+            camera,
+            view: ViewMode::Beauty,
+            blend: BlendMode::PartialDerivatives,
+            wrinkles: true,
+            exposure: 1.0,
+            studio: Studio::default(),
+            key_turn: 0.0,
+            skin: SkinSettings::default(),
+            grain: 0.0,
+            is_smoothed: true,
+        }
     }
 }
 
@@ -69,14 +118,24 @@ pub struct Renderer {
     pipelines: Pipelines,
     background: wgpu::RenderPipeline,
     shadow: Shadow,
+    environment: wgpu::Texture,
+    /// What the environment's texture holds, and its irradiance.
+    lit_by: Option<(Studio, [Vec3; 9])>,
+    scattering: Scattering,
+    tone: Tone,
     frame_block: wgpu::Buffer,
     frame_group: wgpu::BindGroup,
     frame_group_unlit: wgpu::BindGroup,
     presenter: Presenter,
     targets: Option<Targets>,
+    /// Pictures so far: the grain changes with it.
+    num_drawn: u32,
     static_bytes: u64,
     target_format: wgpu::TextureFormat,
 }
+
+/// Of the demonstration of Jimenez and others (2010), whose translucency of 0.83 comes to 0.935 per mm.
+const FLESH_PER_MM: f32 = 0.935;
 
 /// Sphere round the neutral character, metres, model space.
 #[derive(Debug, Clone, Copy)]
@@ -95,6 +154,7 @@ impl Renderer {
         let group = uploader.character(&layouts, asset);
         let frame_block = uploader.uniform("frame", size_of::<uniforms::Frame>());
         let shadow = Shadow::new(device, &layouts);
+        let environment = environment_texture(device);
         let frame_group = device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("frame"),
             layout: &layouts.frame,
@@ -102,6 +162,9 @@ impl Renderer {
                 upload::entry(0, frame_block.as_entire_binding()),
                 upload::entry(1, wgpu::BindingResource::TextureView(&shadow.map)),
                 upload::entry(2, wgpu::BindingResource::Sampler(&shadow.sampler)),
+                upload::entry(3, wgpu::BindingResource::TextureView(&shadow.depth_in_metres)),
+                upload::entry(4, wgpu::BindingResource::TextureView(&environment.create_view(&wgpu::TextureViewDescriptor::default()))),
+                upload::entry(5, wgpu::BindingResource::Sampler(&fullscreen::sampler(device))),
             ],
         });
         let frame_group_unlit = device.create_bind_group(&wgpu::BindGroupDescriptor {
@@ -118,11 +181,16 @@ impl Renderer {
             background: background::pipeline(device),
             static_bytes: uploader.bytes + shadow.bytes,
             shadow,
+            environment,
+            lit_by: None,
+            scattering: Scattering::new(device),
+            tone: Tone::new(device),
             frame_block,
             frame_group,
             frame_group_unlit,
             presenter: Presenter::new(device, target_format),
             targets: None,
+            num_drawn: 0,
             primitives,
             target_format,
         }
@@ -146,12 +214,18 @@ impl Renderer {
         let size = size.map(|side| side.max(1));
         let targets = match self.targets.take() {
             Some(targets) if targets.size == size => targets,
-            _ => self.presenter.targets(device, size),
+            _ => Targets::new(device, size, &self.scattering, &self.tone, &self.presenter),
         };
         self.write_uniforms(queue, size, settings, frame);
         self.draw_shadow(encoder);
         self.draw_scene(device, encoder, &targets, settings);
-        self.presenter.draw(encoder, &targets, target);
+        let is_scattered = settings.view.is_lit() && settings.skin.scattering > 0.0;
+        if is_scattered {
+            self.scattering.draw(encoder, &targets);
+        }
+        let tone_group = if is_scattered { &targets.tone_scattered } else { &targets.tone_plain };
+        fullscreen::draw(encoder, "tone", &self.tone.pipeline, tone_group, &targets.picture);
+        fullscreen::draw(encoder, "present", &self.presenter.pipeline, &targets.present_group, target);
         self.targets = Some(targets);
     }
 
@@ -170,7 +244,10 @@ impl Renderer {
         self.static_bytes + self.targets.as_ref().map_or(0, |targets| targets.bytes)
     }
 
-    fn write_uniforms(&self, queue: &wgpu::Queue, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) {
+    fn write_uniforms(&mut self, queue: &wgpu::Queue, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) {
+        if self.lit_by.is_none_or(|(studio, _)| studio != settings.studio) {
+            self.light(queue, settings.studio);
+        }
         let character = &*self.character;
         let at_rest;
         let frame = if frame.fits(character) {
@@ -190,13 +267,44 @@ impl Renderer {
         queue.write_buffer(&self.group.coefficients, 0, bytemuck::cast_slice(&coefficients));
         queue.write_buffer(&self.frame_block, 0, bytemuck::bytes_of(&self.frame_uniforms(size, settings, frame)));
 
+        let lens = Lens { aspect: size[0] as f32 / size[1] as f32, fovy: settings.camera.fovy, distance: settings.camera.distance };
+        self.scattering.write(queue, lens, settings.skin.scattering);
+        let shown = match settings.view {
+            view if !view.is_lit() => Shown::Raw,
+            ViewMode::Term(Term::Diffuse) => Shown::Diffuse,
+            ViewMode::Term(Term::Specular) => Shown::Specular,
+            ViewMode::Term(Term::Scattering) => Shown::Scattering,
+            _ => Shown::All,
+        };
+        self.num_drawn = self.num_drawn.wrapping_add(1);
+        let tone = uniforms::Tone { exposure: settings.exposure, grain: settings.grain, seed: self.num_drawn, shown: shown as u32 };
+        queue.write_buffer(&self.tone.block, 0, bytemuck::bytes_of(&tone));
         let present = uniforms::Present {
-            exposure: settings.exposure,
-            is_display_ready: u32::from(matches!(settings.view, ViewMode::Influence(_) | ViewMode::Normals | ViewMode::Wireframe)),
             target_encodes_srgb: u32::from(self.presenter.target_encodes_srgb),
             is_split: u32::from(settings.view == ViewMode::Split),
+            is_smoothed: u32::from(settings.is_smoothed && settings.view.is_lit()),
+            padding: 0,
         };
         queue.write_buffer(&self.presenter.block, 0, bytemuck::bytes_of(&present));
+    }
+
+    /// Fills the environment for a set-up.
+    fn light(&mut self, queue: &wgpu::Queue, studio: Studio) {
+        for (level, texels) in environment::levels(studio).iter().enumerate() {
+            let side = environment::SIDE >> level;
+            queue.write_texture(
+                wgpu::TexelCopyTextureInfo {
+                    texture: &self.environment,
+                    mip_level: level as u32,
+                    origin: wgpu::Origin3d::ZERO,
+                    aspect: wgpu::TextureAspect::All,
+                },
+                texels,
+                wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(8 * side), rows_per_image: None },
+                wgpu::Extent3d { width: side, height: side, depth_or_array_layers: 1 },
+            );
+        }
+        self.lit_by = Some((studio, environment::irradiance(studio)));
     }
 
     fn frame_uniforms(&self, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> uniforms::Frame {
@@ -218,15 +326,19 @@ impl Renderer {
         let eye = settings.camera.eye();
         uniforms::Frame {
             clip_from_world: settings.camera.clip_from_world(size[0] as f32 / size[1] as f32).to_cols_array_2d(),
-            shadow_from_world: studio::shadow_from_world(centre, radius).to_cols_array_2d(),
+            shadow_from_world: settings.studio.shadow_from_world(settings.key_turn, centre, radius).to_cols_array_2d(),
             head_from_world: uniforms::rows_of(&head_from_world),
             eye: eye.extend(2.0 * radius / shadow::SIDE as f32).to_array(),
-            lights: studio::lights(),
-            sky: Vec3::from(studio::SKY).extend(0.0).to_array(),
-            ground: Vec3::from(studio::GROUND).extend(0.0).to_array(),
+            forward: (settings.camera.target - eye).normalize_or(Vec3::NEG_Z).extend(settings.camera.distance).to_array(),
+            light_depth: settings.studio.light_depth(settings.key_turn, centre).to_array(),
+            lights: settings.studio.lights(settings.key_turn),
+            irradiance: self.lit_by.map_or([Vec3::ZERO; 9], |(_, irradiance)| irradiance).map(|e| e.extend(0.0).to_array()),
             mouth: mouth.middle.extend(mouth.half_width).to_array(),
             mouth_shape: [mouth.light_reach(), mouth.corner_depth, 0.0, 0.0],
             eyeballs: eyeballs(character),
+            gazes: gazes(character, frame),
+            skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
+            shown: [u32::from(settings.view == ViewMode::Term(Term::Translucency)), 0, 0, 0],
             shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
         }
     }
@@ -245,12 +357,16 @@ impl Renderer {
     fn draw_scene(&mut self, device: &wgpu::Device, encoder: &mut wgpu::CommandEncoder, targets: &Targets, settings: &DrawSettings) {
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("scene"),
-            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
-                view: &targets.samples,
-                depth_slice: None,
-                resolve_target: Some(&targets.scene),
-                ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color::BLACK), store: wgpu::StoreOp::Discard },
-            })],
+            color_attachments: &[(&targets.specular_samples, &targets.specular), (&targets.diffuse_samples, &targets.diffuse)].map(
+                |(samples, resolved)| {
+                    Some(wgpu::RenderPassColorAttachment {
+                        view: samples,
+                        depth_slice: None,
+                        resolve_target: Some(resolved),
+                        ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color::BLACK), store: wgpu::StoreOp::Discard },
+                    })
+                },
+            ),
             depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
                 view: &targets.depth,
                 depth_ops: Some(wgpu::Operations { load: wgpu::LoadOp::Clear(1.0), store: wgpu::StoreOp::Discard }),
@@ -264,7 +380,7 @@ impl Renderer {
         pass.draw(0..3, 0..1);
         let blend = Look::blend_index(settings.blend);
         match settings.view {
-            ViewMode::Beauty => self.draw_primitives(device, &mut pass, Look::Wrinkled(blend)),
+            ViewMode::Beauty | ViewMode::Term(_) => self.draw_primitives(device, &mut pass, Look::Wrinkled(blend)),
             ViewMode::Bare => self.draw_primitives(device, &mut pass, Look::Bare),
             ViewMode::Influence(_) => self.draw_primitives(device, &mut pass, Look::Influence),
             ViewMode::Normals => self.draw_primitives(device, &mut pass, Look::Normals(blend)),
@@ -325,6 +441,19 @@ impl Renderer {
             pass.draw_indexed(0..primitive.num_edge_indices, 0, 0..1);
         }
     }
+}
+
+fn environment_texture(device: &wgpu::Device) -> wgpu::Texture {
+    device.create_texture(&wgpu::TextureDescriptor {
+        label: Some("environment"),
+        size: wgpu::Extent3d { width: environment::SIDE, height: environment::SIDE, depth_or_array_layers: 1 },
+        mip_level_count: environment::NUM_LEVELS,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format: environment::FORMAT,
+        usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+        view_formats: &[],
+    })
 }
 
 impl Bounds {

@@ -64,3 +64,12 @@ pub fn eyeballs(character: &Character) -> [[f32; 4]; 2] {
     };
     [centre(Side::Left, [42, 45]).extend(radius).to_array(), centre(Side::Right, [36, 39]).extend(radius).to_array()]
 }
+
+/// Where the eyes look, left and right: unit vectors, world space.
+pub fn gazes(character: &Character, frame: &RenderFrame) -> [[f32; 4]; 2] {
+    [Side::Left, Side::Right].map(|side| {
+        let bone = character.bones.iter().position(|bone| matches!(bone.drive, Drive::Eye { eye, .. } if eye == side));
+        let in_head = bone.map_or(Vec3::Z, |bone| frame.rotations[bone] * Vec3::Z);
+        (frame.head.rotation * in_head).extend(0.0).to_array()
+    })
+}

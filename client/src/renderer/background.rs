@@ -35,7 +35,7 @@ pub fn pipeline(device: &wgpu::Device) -> wgpu::RenderPipeline {
             module: &module,
             entry_point: Some("fs_background"),
             compilation_options: Default::default(),
-            targets: &[Some(SCENE_FORMAT.into())],
+            targets: &[Some(SCENE_FORMAT.into()), Some(SCENE_FORMAT.into())],
         }),
         multiview_mask: None,
         cache: None,

@@ -5,7 +5,7 @@ use super::uniforms;
 /// The layouts all passes share.
 #[derive(Debug)]
 pub struct Layouts {
-    /// Group 0 with the shadow map.
+    /// Group 0 with the shadow maps and what lies all round.
     pub frame: wgpu::BindGroupLayout,
     /// Group 0 without it: for the pass that draws the shadow map.
     pub frame_unlit: wgpu::BindGroupLayout,
@@ -25,6 +25,8 @@ impl Layouts {
         let group = |label: &str, entries: &[wgpu::BindGroupLayoutEntry]| {
             device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(label), entries })
         };
+        let filtered = wgpu::TextureSampleType::Float { filterable: true };
+        let sampler = wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering);
         let frame_block = uniform(0, Stages::VERTEX_FRAGMENT, size_of::<uniforms::Frame>());
         let frame = group(
             "frame",
@@ -32,11 +34,12 @@ impl Layouts {
                 frame_block,
                 binding(1, Stages::FRAGMENT, texture(wgpu::TextureSampleType::Depth, wgpu::TextureViewDimension::D2)),
                 binding(2, Stages::FRAGMENT, wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Comparison)),
+                binding(3, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),
+                binding(4, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),
+                binding(5, Stages::FRAGMENT, sampler),
             ],
         );
         let frame_unlit = group("frame without shadow map", &[frame_block]);
-        let filtered = wgpu::TextureSampleType::Float { filterable: true };
-        let sampler = wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering);
         let character = group(
             "character",
             &[

@@ -5,7 +5,7 @@ use super::view::BlendMode;
 use crate::asset::{Alpha, Surface, Vertex};
 use std::collections::BTreeMap;
 
-/// The scene is linear light until it is presented.
+/// The scene is linear light until the tone pass: highlights in one attachment, what came out of surfaces in another.
 pub const SCENE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;
 pub const DEPTH_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Depth32Float;
 /// Samples a pixel of the scene: what every device offers.
@@ -213,16 +213,16 @@ struct SceneParts<'a> {
     constants: &'a [(&'a str, f64)],
     topology: wgpu::PrimitiveTopology,
     cull_mode: Option<wgpu::Face>,
-    /// Adds its light to what lies under it.
+    /// Adds its highlights to those of what lies under it.
     is_film: bool,
     alpha_to_coverage: bool,
 }
 
 fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::RenderPipeline {
     let options = wgpu::PipelineCompilationOptions { constants: parts.constants, ..Default::default() };
-    let over = wgpu::BlendComponent {
+    let sum = wgpu::BlendComponent {
         src_factor: wgpu::BlendFactor::One,
-        dst_factor: wgpu::BlendFactor::OneMinusSrcAlpha,
+        dst_factor: wgpu::BlendFactor::One,
         operation: wgpu::BlendOperation::Add,
     };
     device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
@@ -247,11 +247,18 @@ fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::Render
             module: parts.module,
             entry_point: Some(parts.fragment_entry),
             compilation_options: options,
-            targets: &[Some(wgpu::ColorTargetState {
-                format: SCENE_FORMAT,
-                blend: parts.is_film.then_some(wgpu::BlendState { color: over, alpha: over }),
-                write_mask: wgpu::ColorWrites::ALL,
-            })],
+            targets: &[
+                Some(wgpu::ColorTargetState {
+                    format: SCENE_FORMAT,
+                    blend: parts.is_film.then_some(wgpu::BlendState { color: sum, alpha: sum }),
+                    write_mask: if parts.is_film { wgpu::ColorWrites::COLOR } else { wgpu::ColorWrites::ALL },
+                }),
+                Some(wgpu::ColorTargetState {
+                    format: SCENE_FORMAT,
+                    blend: None,
+                    write_mask: if parts.is_film { wgpu::ColorWrites::empty() } else { wgpu::ColorWrites::ALL },
+                }),
+            ],
         }),
         multiview_mask: None,
         cache: None,

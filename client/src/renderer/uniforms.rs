@@ -31,33 +31,45 @@ pub struct Frame {
     pub head_from_world: [[f32; 4]; 3],
     /// Camera, world space; w: metres a shadow texel covers.
     pub eye: [f32; 4],
+    /// Unit vector the camera looks along; w: metres to its target.
+    pub forward: [f32; 4],
+    /// Row that gives metres along the key light.
+    pub light_depth: [f32; 4],
     /// Key, fill, two rims.
     pub lights: [Light; 4],
-    /// Irradiance from above, linear RGB.
-    pub sky: [f32; 4],
-    /// Irradiance from below, linear RGB.
-    pub ground: [f32; 4],
+    /// Light from all round, spherical harmonics, linear RGB.
+    pub irradiance: [[f32; 4]; 9],
     /// Middle of the inner lips, head space; w: half the mouth's width.
     pub mouth: [f32; 4],
     /// How deep light reaches into the mouth, how far its corners lie behind its middle, in units of half its width.
     pub mouth_shape: [f32; 4],
     /// Centres, head space, left and right; w: radius.
     pub eyeballs: [[f32; 4]; 2],
+    /// Where the eyes look, world space.
+    pub gazes: [[f32; 4]; 2],
+    /// How fast light dies in flesh (1/mm), highlights, roughness, how much light leaks through: all multipliers.
+    pub skin: [f32; 4],
     /// 1 for each pose the influence view shows.
     pub shown_poses: [[f32; 4]; MAX_POSE_VECTORS],
+    /// x: 1 shows only what shines through.
+    pub shown: [u32; 4],
 }
 assert_layout!(Frame, frame, {
     clip_from_world: CLIP_FROM_WORLD,
     shadow_from_world: SHADOW_FROM_WORLD,
     head_from_world: HEAD_FROM_WORLD,
     eye: EYE,
+    forward: FORWARD,
+    light_depth: LIGHT_DEPTH,
     lights: LIGHTS,
-    sky: SKY,
-    ground: GROUND,
+    irradiance: IRRADIANCE,
     mouth: MOUTH,
     mouth_shape: MOUTH_SHAPE,
     eyeballs: EYEBALLS,
+    gazes: GAZES,
+    skin: SKIN,
     shown_poses: SHOWN_POSES,
+    shown: SHOWN,
 });
 
 /// Joint matrices, three rows each.
@@ -110,25 +122,60 @@ pub struct Material {
 }
 assert_layout!(Material, material, { base_color: BASE_COLOR, normal_scale: NORMAL_SCALE, roughness: ROUGHNESS, occlusion_strength: OCCLUSION_STRENGTH });
 
+/// Group 0 of the scattering draws.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Scatter {
+    /// Weights by colour, offset in mm.
+    pub kernel: [[f32; 4]; 25],
+    /// Part of the picture a millimetre covers at a metre, along the direction.
+    pub uv_per_mm_at_metre: [f32; 2],
+    /// Metres from the camera at which the stored depth is zero.
+    pub depth_origin: f32,
+    /// Share given back by metre of difference in depth.
+    pub rejection: f32,
+    /// Samples used.
+    pub num_samples: u32,
+    /// Fills the block up.
+    pub padding: [u32; 3],
+}
+assert_layout!(Scatter, scatter, {
+    kernel: KERNEL,
+    uv_per_mm_at_metre: UV_PER_MM_AT_METRE,
+    depth_origin: DEPTH_ORIGIN,
+    rejection: REJECTION,
+    num_samples: NUM_SAMPLES,
+});
+
+/// Group 0 of the tone pass.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Tone {
+    /// Multiplies the light before the tone curve.
+    pub exposure: f32,
+    /// Standard deviation of the film grain, display values.
+    pub grain: f32,
+    /// Of the grain.
+    pub seed: u32,
+    /// What is shown.
+    pub shown: u32,
+}
+assert_layout!(Tone, tone, { exposure: EXPOSURE, grain: GRAIN, seed: SEED, shown: SHOWN });
+
 /// Group 0 of the last pass.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct Present {
-    /// Multiplies the light before the tone curve.
-    pub exposure: f32,
-    /// 1: the scene holds display values.
-    pub is_display_ready: u32,
     /// 1: the target's format encodes sRGB.
     pub target_encodes_srgb: u32,
     /// 1: a line parts the halves.
     pub is_split: u32,
+    /// 1: edges are smoothed.
+    pub is_smoothed: u32,
+    /// Fills the block up.
+    pub padding: u32,
 }
-assert_layout!(Present, present, {
-    exposure: EXPOSURE,
-    is_display_ready: IS_DISPLAY_READY,
-    target_encodes_srgb: TARGET_ENCODES_SRGB,
-    is_split: IS_SPLIT,
-});
+assert_layout!(Present, present, { target_encodes_srgb: TARGET_ENCODES_SRGB, is_split: IS_SPLIT, is_smoothed: IS_SMOOTHED });
 
 /// The three rows of `target_from_source`.
 pub fn rows_of(transform: &Affine3A) -> [[f32; 4]; 3] {

@@ -18,6 +18,36 @@ pub enum ViewMode {
     Wireframe,
     /// Left half of the picture with wrinkles, right half without.
     Split,
+    /// One part of the light.
+    Term(Term),
+}
+
+/// A part of the light, shown by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Term {
+    /// What comes out of the skin, scattered.
+    Diffuse,
+    /// Highlights.
+    Specular,
+    /// What scattering changes, about a middle grey.
+    Scattering,
+    /// What the key light sends through thin flesh.
+    Translucency,
+}
+
+impl Term {
+    /// Every term.
+    pub const ALL: [Self; 4] = [Self::Diffuse, Self::Specular, Self::Scattering, Self::Translucency];
+
+    /// Its name on command lines.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Diffuse => "diffuse",
+            Self::Specular => "specular",
+            Self::Scattering => "scattering",
+            Self::Translucency => "translucency",
+        }
+    }
 }
 
 /// Why a view's name was refused.
@@ -36,10 +66,12 @@ impl ViewMode {
         let mut views = vec![Self::Beauty, Self::Bare, Self::Split, Self::Influence(None)];
         views.extend((0..character.num_poses()).map(|k| Self::Influence(Some(k))));
         views.extend([Self::Normals, Self::Wireframe]);
+        views.extend(Term::ALL.map(Self::Term));
         views
     }
 
-    /// Reads `beauty`, `bare`, `split`, `influence`, `influence:POSE` (a pose's name), `normals` or `wireframe`.
+    /// Reads `beauty`, `bare`, `split`, `influence`, `influence:POSE` (a pose's name), `normals`, `wireframe` or a term of
+    /// the light.
     pub fn parse(text: &str, character: &Character) -> Result<Self, ViewError> {
         let all = Self::all(character);
         all.iter().copied().find(|view| view.name(character) == text).ok_or_else(|| ViewError {
@@ -61,7 +93,13 @@ impl ViewMode {
             Self::Normals => "normals".into(),
             Self::Wireframe => "wireframe".into(),
             Self::Split => "split".into(),
+            Self::Term(term) => term.name().into(),
         }
+    }
+
+    /// True for views of light rather than of numbers: they are scattered and toned.
+    pub fn is_lit(self) -> bool {
+        !matches!(self, Self::Influence(_) | Self::Normals | Self::Wireframe)
     }
 }
 

@@ -1,4 +1,5 @@
 // A dark grey studio wall, a little lighter behind the head.
+//!include output
 
 struct Varyings {
     @builtin(position) clip: vec4<f32>,
@@ -14,8 +15,8 @@ fn vs_background(@builtin(vertex_index) index: u32) -> Varyings {
 }
 
 @fragment
-fn fs_background(in: Varyings) -> @location(0) vec4<f32> {
+fn fs_background(in: Varyings) -> Shaded {
     let distance = length((in.at - vec2<f32>(0.0, 0.1)) * vec2<f32>(0.85, 0.75));
     let light = mix(0.115, 0.030, smoothstep(0.0, 1.35, distance));
-    return vec4<f32>(vec3<f32>(0.96, 0.99, 1.04) * light, 1.0);
+    return Shaded(vec4<f32>(0.0, 0.0, 0.0, 1.0), vec4<f32>(vec3<f32>(0.96, 0.99, 1.04) * light, FAR));
 }

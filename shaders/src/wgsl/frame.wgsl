@@ -1,4 +1,5 @@
 // What is the same for every draw of a frame. World space is the character's model space: metres, +Y up, +Z out of the face.
+//!include output
 
 struct Light {
     // Unit vector towards the light, world space.
@@ -15,24 +16,55 @@ struct Frame {
     head_from_world: array<vec4<f32>, 3>,
     // World space; w: metres a shadow texel covers.
     eye: vec4<f32>,
+    // Unit vector the camera looks along; w: metres to its target.
+    forward: vec4<f32>,
+    // dot with (world, 1): metres behind the middle of the shadow map's range, along the key light.
+    light_depth: vec4<f32>,
     // Key (it alone casts shadows), fill, two rims.
     lights: array<Light, 4>,
-    // Irradiance from above and from below, linear RGB.
-    sky: vec4<f32>,
-    ground: vec4<f32>,
+    // Light from all round on a white surface, nine coefficients of spherical harmonics, linear RGB.
+    irradiance: array<vec4<f32>, 9>,
     // Middle of the inner lips in head space; w: half the mouth's width.
     mouth: vec4<f32>,
     // x: how deep light reaches into the mouth. y: how far its corners lie behind its middle. In units of mouth.w.
     mouth_shape: vec4<f32>,
     // Centres of the eyeballs in head space, left and right; w: radius.
     eyeballs: array<vec4<f32>, 2>,
+    // Where they look: unit vectors, world space.
+    gazes: array<vec4<f32>, 2>,
+    // x: 1/mm, how fast light dies in the flesh (see transmittance). y: strength of highlights. z: roughness, multiplied.
+    // w: how much light leaks through.
+    skin: vec4<f32>,
     // Influence view: 1 for each pose shown.
     shown_poses: array<vec4<f32>, 2>,
+    // x: see the constants.
+    shown: vec4<u32>,
 }
+
+// Only what shines through flesh is shown.
+const SHOW_TRANSLUCENCY: u32 = 1u;
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 
 fn head_from_world(world: vec3<f32>) -> vec3<f32> {
     let p = vec4<f32>(world, 1.0);
     return vec3<f32>(dot(frame.head_from_world[0], p), dot(frame.head_from_world[1], p), dot(frame.head_from_world[2], p));
+}
+
+// Metres behind the camera's target.
+fn depth_of(world: vec3<f32>) -> f32 {
+    return dot(world - frame.eye.xyz, frame.forward.xyz) - frame.forward.w;
+}
+
+// `scattering` is how much light bleeds sideways, 0 to 1.
+fn shaded(world: vec3<f32>, diffuse: vec3<f32>, specular: vec3<f32>, scattering: f32) -> Shaded {
+    if frame.shown.x == SHOW_TRANSLUCENCY {
+        return Shaded(vec4<f32>(0.0, 0.0, 0.0, 1.0), vec4<f32>(0.0, 0.0, 0.0, depth_of(world)));
+    }
+    return Shaded(vec4<f32>(specular, 1.0 + scattering), vec4<f32>(diffuse, depth_of(world)));
+}
+
+// Display values: they pass through all that follows as they are.
+fn display(colour: vec3<f32>) -> Shaded {
+    return Shaded(vec4<f32>(0.0, 0.0, 0.0, 1.0), vec4<f32>(colour, 0.0));
 }

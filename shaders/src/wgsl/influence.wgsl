@@ -19,7 +19,7 @@ fn heat(value: f32) -> vec3<f32> {
 }
 
 @fragment
-fn fs_influence(in: Varyings) -> @location(0) vec4<f32> {
+fn fs_influence(in: Varyings) -> Shaded {
     let view = normalize(frame.eye.xyz - in.world);
     let grey = 0.18 + 0.52 * clamp(dot(normalize(in.normal), view), 0.0, 1.0);
     var num_shown = 0.0;
@@ -34,5 +34,5 @@ fn fs_influence(in: Varyings) -> @location(0) vec4<f32> {
     }
     let colour = select(hue / max(total, 1e-4), heat(total), num_shown < 1.5);
     let cover = clamp(total * 1.4, 0.0, 1.0);
-    return vec4<f32>(mix(vec3<f32>(grey), colour * (0.45 + 0.55 * grey / 0.7), cover), 1.0);
+    return display(mix(vec3<f32>(grey), colour * (0.45 + 0.55 * grey / 0.7), cover));
 }

@@ -2,11 +2,11 @@
 //!include surface
 
 @fragment
-fn fs_wrinkled(in: Varyings) -> @location(0) vec4<f32> {
-    return vec4<f32>(wrinkled_normal(in) * 0.5 + 0.5, 1.0);
+fn fs_wrinkled(in: Varyings) -> Shaded {
+    return display(wrinkled_normal(in) * 0.5 + 0.5);
 }
 
 @fragment
-fn fs_bare(in: Varyings) -> @location(0) vec4<f32> {
-    return vec4<f32>(bare_normal(in) * 0.5 + 0.5, 1.0);
+fn fs_bare(in: Varyings) -> Shaded {
+    return display(bare_normal(in) * 0.5 + 0.5);
 }

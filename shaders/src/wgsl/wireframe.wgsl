@@ -27,11 +27,11 @@ fn vs_edges(in: VertexIn) -> Varyings {
 }
 
 @fragment
-fn fs_body(in: Varyings) -> @location(0) vec4<f32> {
-    return vec4<f32>(vec3<f32>(0.10, 0.11, 0.13) * (0.5 + 0.5 * clamp(in.facing, 0.0, 1.0)), 1.0);
+fn fs_body(in: Varyings) -> Shaded {
+    return display(vec3<f32>(0.10, 0.11, 0.13) * (0.5 + 0.5 * clamp(in.facing, 0.0, 1.0)));
 }
 
 @fragment
-fn fs_edges(in: Varyings) -> @location(0) vec4<f32> {
-    return vec4<f32>(vec3<f32>(0.45, 0.80, 0.95) * (0.35 + 0.65 * clamp(in.facing, 0.0, 1.0)), 1.0);
+fn fs_edges(in: Varyings) -> Shaded {
+    return display(vec3<f32>(0.45, 0.80, 0.95) * (0.35 + 0.65 * clamp(in.facing, 0.0, 1.0)));
 }

@@ -72,7 +72,7 @@ pub fn build(base: &Base, eyes: [Eyeball; 2], joints: [u8; 2]) -> Part {
                 let at = |angle: f32, radius: f32| Vec3::new(cos * libm::sinf(angle), sin * libm::sinf(angle), libm::cosf(angle)) * radius;
                 let along = at(angle + step, radius_at(angle + step, eye.radius)) - at(angle - step, radius_at(angle - step, eye.radius));
                 part.positions.push(eye.centre + at(angle, radius));
-                part.normals.push(along.cross(Vec3::new(-sin, cos, 0.0)).normalize() * -1.0);
+                part.normals.push(along.cross(Vec3::new(-sin, cos, 0.0)).normalize());
                 part.uvs.push(Vec2::new(0.5, 0.5) + Vec2::new(cos, -sin) * 0.5 * (angle / TEXTURE_ANGLE));
                 part.bindings.push(Binding::rigid(joint));
             }
