@@ -18,6 +18,9 @@ pub const MAX_CHARACTER_BYTES: usize = 64 << 20;
 pub const MAX_TEXTURE_SIDE: u32 = 4096;
 /// Largest message on a publish socket, bytes: 478 points with z and confidence as JSON take 35 KB.
 pub const MAX_MESSAGE_BYTES: usize = 256 << 10;
+/// Largest time on a sender's clock, seconds: the Unix clock stays below it for two centuries, and microseconds of it
+/// are whole numbers in an `f64`.
+pub const MAX_SECONDS: f64 = 9e9;
 /// How far an evaluated point may travel from rest, metres: the range of a packet's 12-bit positions (25 µm a step).
 pub const MAX_BONE_TRAVEL: f32 = 0.0511875;
 /// How far the head may travel from its neutral place, metres.
