@@ -1,7 +1,7 @@
 //! What is asked for over HTTP: pages, listings, the character, and the two kinds of WebSocket.
 
 use crate::service::{Hub, Peer};
-use crate::socket::{Ending, ErrorMessage, close, upgrade};
+use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
 use crate::{publish, viewer};
 use axum::Router;
 use axum::body::Bytes;
@@ -116,8 +116,12 @@ async fn publish_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, r
         Err(error) => return error.response(StatusCode::BAD_REQUEST),
     };
     tracing::debug!(%room, peer = ?request.extensions().get::<Peer>(), "publisher connects");
+    let handshake = match Handshake::check(&request) {
+        Ok(handshake) => handshake,
+        Err(answer) => return *answer,
+    };
     let config = publish::socket_config(&hub);
-    upgrade(request, config, Vec::new(), move |socket| publish::talk(hub, socket, room))
+    upgrade(&hub.clone(), request, handshake, config, Vec::new(), move |socket| publish::talk(hub, socket, room))
 }
 
 async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
@@ -132,17 +136,23 @@ async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, requ
         return ErrorMessage::new("unknown_format", message).response(StatusCode::BAD_REQUEST);
     }
     let wants_json = format == "json";
+    // Before the room: what is no handshake makes none.
+    let handshake = match Handshake::check(&request) {
+        Ok(handshake) => handshake,
+        Err(answer) => return *answer,
+    };
     tracing::debug!(%room, wants_json, peer = ?request.extensions().get::<Peer>(), "viewer connects");
     match hub.rooms.join(&room) {
         Ok(viewing) => {
             let first = viewer::first_frames(&hub, &room);
-            upgrade(request, viewer::socket_config(), first, move |socket| viewer::talk(hub, socket, viewing, wants_json))
+            let config = viewer::socket_config();
+            upgrade(&hub.clone(), request, handshake, config, first, move |socket| viewer::talk(hub, socket, viewing, wants_json))
         }
         // A browser's page cannot read the answer to a handshake, so the refusal is a message.
         Err(error) => {
             let ending = Ending::error(CloseCode::Again, ErrorMessage::new(error.code(), error.to_string()));
             hub.metrics.end(error.code());
-            upgrade(request, viewer::socket_config(), Vec::new(), async move |socket| close(socket, &ending).await)
+            upgrade(&hub, request, handshake, viewer::socket_config(), Vec::new(), async move |socket| close(socket, &ending).await)
         }
     }
 }

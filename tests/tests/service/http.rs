@@ -119,6 +119,15 @@ fn subprotocols_are_chosen_or_refused() {
 }
 
 #[test]
+fn what_is_no_handshake_makes_no_room() {
+    let server = Server::start();
+    assert!(server.get("/v1/rooms/plain/view", "").0.starts_with("HTTP/1.1 426"));
+    assert!(server.connect("/v1/rooms/other/view", &[("Sec-WebSocket-Protocol", "chat")]).is_err());
+    assert_eq!((server.room("plain"), server.room("other")), (None, None));
+    assert_eq!(server.metric("rhytid_rooms"), 0.0);
+}
+
+#[test]
 fn bad_addresses_are_refused() {
     let server = Server::start();
     let long = format!("/v1/rooms/{}/view", "a".repeat(65));
