@@ -13,7 +13,7 @@ use tracing_subscriber::EnvFilter;
 #[derive(Parser)]
 #[command(version, about)]
 struct Cli {
-    /// Say more: -v what happens, -vv every connection and bad message.
+    /// Say more: -v every connection and bad message, -vv also what libraries do.
     #[arg(short, long, action = clap::ArgAction::Count, global = true)]
     verbose: u8,
     /// Write the log as JSON, one object a line.
@@ -111,8 +111,9 @@ async fn main() -> ExitCode {
 fn start_log(cli: &Cli) {
     let level = match (cli.verbose, &cli.command) {
         (0, Command::Send(_)) => "warn",
-        (0, Command::Serve(_)) | (1, _) => "rhytid_server=info,warn",
-        _ => "rhytid_server=debug,info",
+        (0, Command::Serve(_)) => "rhytid_server=info,warn",
+        (1, _) => "rhytid_server=debug,info",
+        _ => "debug",
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
@@ -139,6 +140,7 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "max-message": limits.message_bytes,
         "max-fps": limits.frames_per_second,
         "max-bad-frames": limits.bad_frames_in_a_row,
+        "max-connections-in-all": limits.connections,
         "max-connections": limits.connections_per_address,
         "hello-timeout": timeouts.hello,
         "ping-interval": timeouts.ping,
@@ -155,11 +157,14 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
 
     let mut interrupt = Signals::new().context("cannot wait for signals")?;
     // Before the port is bound: who sees the line below may connect, and a broken character must not leave a port behind.
-    load_character(config.character.as_deref())?;
+    let character = load_character(config.character.as_deref())?;
     let listener = bind(&config.listen).await?;
-    println!("listening on http://{}", listener.local_addr()?);
-    std::io::stdout().flush()?;
-    run(listener, config, async move { interrupt.wait().await }).await?;
+    let mut output = std::io::stdout();
+    if let Err(error) = writeln!(output, "listening on http://{}", listener.local_addr()?).and_then(|()| output.flush()) {
+        // Who closed it does not want to know; who connects is served all the same.
+        tracing::warn!(%error, "cannot write to standard output");
+    }
+    run(listener, config, character, async move { interrupt.wait().await }).await?;
     Ok(())
 }
 

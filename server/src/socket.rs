@@ -2,6 +2,7 @@
 
 use crate::metrics::Metrics;
 use crate::service::{Hub, Place, stopped};
+use crate::stream::TimedStream;
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -140,12 +141,12 @@ where
     let upgraded = hyper::upgrade::on(&mut request);
     let place = request.extensions().get::<Arc<Place>>().cloned();
     tokio::spawn(async move {
-        let parts = match upgraded.await.map(hyper::upgrade::Upgraded::downcast::<TokioIo<TcpStream>>) {
+        let parts = match upgraded.await.map(hyper::upgrade::Upgraded::downcast::<TokioIo<TimedStream>>) {
             Ok(Ok(parts)) => parts,
             Ok(Err(_)) => return tracing::error!("an upgraded connection is not the TCP stream it was"),
             Err(error) => return tracing::debug!(%error, "the upgrade did not happen"),
         };
-        let mut stream = parts.io.into_inner();
+        let mut stream = parts.io.into_inner().into_inner();
         // The first frames go around the WebSocket's write buffer, which would keep their size for as long as it lives.
         let is_written = tokio::select! {
             biased;
@@ -279,6 +280,17 @@ async fn farewell(mut socket: Socket) {
     };
     // A peer that stays silent is cut off.
     let _ = tokio::time::timeout(CLOSE_TIMEOUT, reading).await;
+}
+
+/// Says the last word on a connection that has not become a socket.
+pub(crate) async fn say_and_close(mut stream: TcpStream, bytes: &[u8]) {
+    let saying = async {
+        if stream.write_all(bytes).await.is_ok() {
+            drain(&mut stream).await;
+        }
+    };
+    // A peer that stays is cut off.
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, saying).await;
 }
 
 /// Ends the sending half, then reads what still comes and throws it away, up to [`MOST_DRAINED`] bytes: a connection that is
