@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 /// Passes: each file holds the entry points of one.
 const PASSES: [&str; 11] = ["background", "eye", "hair", "influence", "normals", "plain", "present", "shadow", "skin", "wet", "wireframe"];
 /// Parts that are exported by themselves, too: tests build passes of their own from them.
-const PARTS: [&str; 2] = ["skinning", "wrinkles"];
+const PARTS: [&str; 3] = ["skinning", "surface", "wrinkles"];
 /// `//!include NAME` on a line of its own puts `NAME.wgsl` there, once.
 const INCLUDE: &str = "//!include ";
 /// The smallest uniform block every WebGL2 device takes, bytes.
