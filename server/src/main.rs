@@ -1,12 +1,15 @@
 //! The server's command line: `serve` and `send`.
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
-use rhytid_server::{Access, Limits, SendOptions, SendSource, ServerConfig, Timeouts, bind, clip_feed, load_character, run, send};
+use rhytid_server::{
+    Access, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, bind, clip_feed, load_character, run, send,
+};
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 use tracing_subscriber::EnvFilter;
 
 /// Turns what a face tracker sees into a moving, wrinkled face and streams it to viewers.
@@ -76,6 +79,9 @@ struct SendArgs {
     /// Take the room over from another publisher.
     #[arg(long)]
     takeover: bool,
+    /// How long the server may take to accept the connection, to answer the hello, and to read a message.
+    #[arg(long, default_value = "15", value_name = "SECONDS", value_parser = parse_seconds)]
+    timeout: Duration,
 }
 
 fn parse_speed(text: &str) -> Result<f64, String> {
@@ -84,6 +90,11 @@ fn parse_speed(text: &str) -> Result<f64, String> {
         Ok(speed) if speed > 0.0 && speed.is_finite() => Ok(speed),
         _ => Err("expected a number more than 0, or max".into()),
     }
+}
+
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse().ok().filter(|seconds| (0.01..=86_400.0).contains(seconds));
+    seconds.map(Duration::from_secs_f64).ok_or_else(|| "expected seconds from 0.01 to 86400".into())
 }
 
 #[tokio::main]
@@ -228,17 +239,20 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
     let progress = ProgressBar::new(0);
     progress
         .set_style(ProgressStyle::with_template("{elapsed_precise} [{bar:40}] {percent:>3}% {bytes}/{total_bytes}")?.progress_chars("=> "));
-    let options = SendOptions { source, to: args.to, room: args.room, speed: args.speed, repeats: args.repeats, takeover: args.takeover };
-    let mut interrupt = Signals::new().context("cannot wait for signals")?;
-    let report = tokio::select! {
-        report = send(&options, &progress) => report,
-        () = interrupt.wait() => {
-            progress.abandon();
-            return Ok(());
-        }
+    let options = SendOptions {
+        source,
+        to: args.to,
+        room: args.room,
+        speed: args.speed,
+        repeats: args.repeats,
+        takeover: args.takeover,
+        timeout: args.timeout,
     };
+    let mut interrupt = Signals::new().context("cannot wait for signals")?;
+    let report = send(&options, &progress, async move { interrupt.wait().await }).await;
     progress.finish_and_clear();
-    let report = report?;
-    eprintln!("sent {} frames, {} refused", report.frames, report.errors);
+    let SendReport { frames, errors } = report?;
+    ensure!(errors == 0, "sent {frames} frames, of all messages the server refused {errors}");
+    eprintln!("sent {frames} frames, none refused");
     Ok(())
 }
