@@ -221,7 +221,8 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    fn new(mut client: Client) -> Self {
+    /// Takes the hello.
+    pub fn new(mut client: Client) -> Self {
         let text = client.text();
         let Ok(ViewMessage::Hello(hello)) = serde_json::from_str(&text) else { panic!("the first message is no hello: {text}") };
         // The pong that the ping before the hello asks for.
