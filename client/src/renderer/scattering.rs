@@ -61,7 +61,7 @@ pub fn kernel(count: usize) -> Vec<KernelSample> {
 
 /// Pipeline and blocks of both draws.
 #[derive(Debug)]
-pub struct Scattering {
+pub(super) struct Scattering {
     pipeline: wgpu::RenderPipeline,
     pub layout: wgpu::BindGroupLayout,
     /// Across and up.
@@ -71,7 +71,7 @@ pub struct Scattering {
 
 /// What the draws need to know of the picture.
 #[derive(Debug, Clone, Copy)]
-pub struct Lens {
+pub(super) struct Lens {
     /// Width over height.
     pub aspect: f32,
     /// Vertical field of view, radians.

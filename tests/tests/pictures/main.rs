@@ -6,6 +6,7 @@
 mod golden;
 mod probe;
 mod properties;
+mod skin;
 mod read_back;
 mod twins;
 
@@ -44,6 +45,7 @@ fn main() -> ExitCode {
         trials.push(trial.with_ignored_flag(stage.is_none()));
     };
     twins::add(&mut add);
+    skin::add(&mut add);
     properties::add(&mut add);
     golden::add(&mut add);
     libtest_mimic::run(&arguments, trials).exit_code()

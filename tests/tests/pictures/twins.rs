@@ -80,14 +80,13 @@ pub fn add(add: &mut Add<'_>) {
         add(format!("twins::blend_{mode}"), Box::new(move |stage| blend(stage, mode)));
         add(format!("twins::wrinkled_normal_{mode}"), Box::new(move |stage| wrinkled_normal(stage, mode)));
     }
-    add("twins::tone_map".into(), Box::new(tone_map));
 }
 
 /// A fixed sequence of values from `low` to `high`.
-struct Sequence(u32);
+pub struct Sequence(pub u32);
 
 impl Sequence {
-    fn next(&mut self, low: f32, high: f32) -> f32 {
+    pub fn next(&mut self, low: f32, high: f32) -> f32 {
         self.0 = self.0.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         low + (high - low) * ((self.0 >> 8) as f32 / 16_777_216.0)
     }
@@ -97,7 +96,7 @@ impl Sequence {
     }
 }
 
-fn headless(stage: &Stage) -> anyhow::Result<MutexGuard<'_, Headless>> {
+pub fn headless(stage: &Stage) -> anyhow::Result<MutexGuard<'_, Headless>> {
     stage.headless.lock().map_err(|_| anyhow::anyhow!("another test broke the renderer"))
 }
 
@@ -370,45 +369,3 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The last pass itself, on light from darkness to far beyond white.
-fn tone_map(stage: &Stage) -> anyhow::Result<()> {
-    const SIZE: [u32; 2] = [64, 4];
-    let lights: Vec<[f32; 4]> = (0..SIZE[0] * SIZE[1])
-        .map(|i| {
-            // 2^-10 to 2^6, and nothing at all.
-            let light = if i == 0 { 0.0 } else { f32::exp2(i as f32 / 16.0 - 10.0) };
-            [light, light * 0.5, light * 0.25, 1.0]
-        })
-        .collect();
-    let headless = headless(stage)?;
-    let scene = texture(&headless, wgpu::TextureFormat::Rgba32Float, SIZE, &[bytemuck::cast_slice(&lights).to_vec()]);
-    let view = scene.create_view(&wgpu::TextureViewDescriptor::default());
-    for exposure in [0.5, 1.0, 2.0] {
-        let present = uniforms::Present { exposure, is_display_ready: 0, target_encodes_srgb: 1, is_split: 0 };
-        let probe = Probe {
-            source: rhytid_shaders::PRESENT,
-            entries: ["vs_present", "fs_present"],
-            constants: &[],
-            groups: &[(
-                0,
-                &[
-                    (0, Resource::Block(bytemuck::bytes_of(&present))),
-                    (1, Resource::Texture { view: &view, dimension: wgpu::TextureViewDimension::D2, is_filterable: false }),
-                ],
-            )],
-            what: What::Picture(SIZE),
-        };
-        for (light, got) in lights.iter().zip(run(&headless, &probe)?) {
-            for channel in 0..3 {
-                let twin = twin::filmic(light[channel], exposure);
-                ensure!(
-                    (got[channel] - twin).abs() < 1e-5,
-                    "light {} at exposure {exposure}: {} on the device, {twin} in the twin",
-                    light[channel],
-                    got[channel]
-                );
-            }
-        }
-    }
-    Ok(())
-}
