@@ -182,13 +182,8 @@ impl PictureMaker {
         camera.orbit(args.orbit[0].to_radians(), args.orbit[1].to_radians());
         camera.zoom(args.zoom);
         let view = ViewMode::parse(&args.view, &asset.character)?;
-        let settings = DrawSettings {
-            view,
-            blend: args.blend,
-            studio: args.light,
-            key_turn: args.key_turn.to_radians(),
-            ..DrawSettings::new(camera)
-        };
+        let settings =
+            DrawSettings { view, blend: args.blend, studio: args.light, key_turn: args.key_turn.to_radians(), ..DrawSettings::new(camera) };
         let headless = Headless::new(&asset)?;
         tracing::info!(adapter = headless.adapter().name, "drawing");
         Ok(Self { asset, headless, settings, size: args.size, supersample: args.supersample })

@@ -17,6 +17,7 @@ pub mod scattering;
 mod shadow;
 mod studio;
 mod targets;
+mod timing;
 mod tone;
 pub mod uniforms;
 mod upload;
@@ -29,6 +30,7 @@ pub use headless::{AdapterChoice, Headless, RenderError, required_limits};
 pub use pipelines::VERTEX_LAYOUT;
 pub(crate) use read_back::read_back;
 pub use studio::{Studio, StudioError};
+pub use timing::{Pass, PassTimer};
 pub use view::{BlendError, BlendMode, Term, ViewError, ViewMode};
 
 use crate::asset::{CharacterAsset, Palette, Surface};
@@ -130,6 +132,8 @@ pub struct Renderer {
     targets: Option<Targets>,
     /// Pictures so far: the grain changes with it.
     num_drawn: u32,
+    /// Draw calls of the last picture.
+    num_draws: u32,
     static_bytes: u64,
     target_format: wgpu::TextureFormat,
 }
@@ -192,6 +196,7 @@ impl Renderer {
             presenter: Presenter::new(device, target_format),
             targets: None,
             num_drawn: 0,
+            num_draws: 0,
             primitives,
             target_format,
         }
@@ -200,7 +205,8 @@ impl Renderer {
     /// Records the drawing of `frame` into `target`, which is `size` pixels large and is overwritten.
     ///
     /// Submit what was recorded before the next call: a frame's uniforms are written to the queue here.
-    /// A frame that does not fit the character ([`RenderFrame::fits`]) is drawn as the character at rest.
+    /// A frame that does not fit the character ([`RenderFrame::fits`]) is drawn as the character at rest. With a `timer`
+    /// each pass is stamped.
     #[allow(clippy::too_many_arguments, reason = "the four wgpu handles come with every call of this kind")]
     pub fn draw(
         &mut self,
@@ -211,22 +217,27 @@ impl Renderer {
         size: [u32; 2],
         settings: &DrawSettings,
         frame: &RenderFrame,
+        timer: Option<&PassTimer>,
     ) {
+        let stamps = |pass: Pass| timer.map(|timer| timer.writes(pass));
+        self.num_draws = 0;
         let size = size.map(|side| side.max(1));
         let targets = match self.targets.take() {
             Some(targets) if targets.size == size => targets,
             _ => Targets::new(device, size, &self.scattering, &self.tone, &self.presenter),
         };
         self.write_uniforms(queue, size, settings, frame);
-        self.draw_shadow(encoder);
-        self.draw_scene(device, encoder, &targets, settings);
+        self.draw_shadow(encoder, stamps(Pass::Shadow));
+        self.draw_scene(device, encoder, &targets, settings, stamps(Pass::Scene));
         let is_scattered = settings.view.is_lit() && settings.skin.scattering > 0.0;
         if is_scattered {
-            self.scattering.draw(encoder, &targets);
+            self.scattering.draw(encoder, &targets, [stamps(Pass::ScatterAcross), stamps(Pass::ScatterUp)]);
+            self.num_draws += 2;
         }
         let tone_group = if is_scattered { &targets.tone_scattered } else { &targets.tone_plain };
-        fullscreen::draw(encoder, "tone", &self.tone.pipeline, tone_group, &targets.picture);
-        fullscreen::draw(encoder, "present", &self.presenter.pipeline, &targets.present_group, target);
+        fullscreen::draw(encoder, Pass::Tone, &self.tone.pipeline, tone_group, &targets.picture, stamps(Pass::Tone));
+        fullscreen::draw(encoder, Pass::Present, &self.presenter.pipeline, &targets.present_group, target, stamps(Pass::Present));
+        self.num_draws += 2;
         self.targets = Some(targets);
     }
 
@@ -238,6 +249,11 @@ impl Renderer {
     /// The character drawn.
     pub fn character(&self) -> &Arc<Character> {
         &self.character
+    }
+
+    /// Draw calls of the last picture.
+    pub fn num_draws(&self) -> u32 {
+        self.num_draws
     }
 
     /// Bytes of buffers and textures this renderer holds on the device.
@@ -344,18 +360,26 @@ impl Renderer {
         }
     }
 
-    fn draw_shadow(&self, encoder: &mut wgpu::CommandEncoder) {
-        let mut pass = self.shadow.begin(encoder);
+    fn draw_shadow(&mut self, encoder: &mut wgpu::CommandEncoder, stamps: Option<wgpu::RenderPassTimestampWrites<'_>>) {
+        let mut pass = self.shadow.begin(encoder, stamps);
         pass.set_bind_group(0, &self.frame_group_unlit, &[]);
         pass.set_bind_group(1, &self.group.group, &[]);
         for primitive in self.primitives.iter().filter(|primitive| !matches!(primitive.surface, Surface::Wet | Surface::Hair)) {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
+            self.num_draws += 1;
         }
     }
 
-    fn draw_scene(&mut self, device: &wgpu::Device, encoder: &mut wgpu::CommandEncoder, targets: &Targets, settings: &DrawSettings) {
+    fn draw_scene(
+        &mut self,
+        device: &wgpu::Device,
+        encoder: &mut wgpu::CommandEncoder,
+        targets: &Targets,
+        settings: &DrawSettings,
+        stamps: Option<wgpu::RenderPassTimestampWrites<'_>>,
+    ) {
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("scene"),
             color_attachments: &[(&targets.specular_samples, &targets.specular), (&targets.diffuse_samples, &targets.diffuse)].map(
@@ -373,12 +397,13 @@ impl Renderer {
                 depth_ops: Some(wgpu::Operations { load: wgpu::LoadOp::Clear(1.0), store: wgpu::StoreOp::Discard }),
                 stencil_ops: None,
             }),
-            timestamp_writes: None,
+            timestamp_writes: stamps,
             occlusion_query_set: None,
             multiview_mask: None,
         });
         pass.set_pipeline(&self.background);
         pass.draw(0..3, 0..1);
+        self.num_draws += 1;
         let blend = Look::blend_index(settings.blend);
         match settings.view {
             ViewMode::Beauty | ViewMode::Term(_) => self.draw_primitives(device, &mut pass, Look::Wrinkled(blend)),
@@ -421,6 +446,7 @@ impl Renderer {
                     let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha, region.poses);
                     pass.set_pipeline(self.pipelines.surface(device, key));
                     pass.draw_indexed(region.indices.clone(), 0, 0..1);
+                    self.num_draws += 1;
                 }
             }
         }
@@ -440,6 +466,7 @@ impl Renderer {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.edges.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..primitive.num_edge_indices, 0, 0..1);
+            self.num_draws += 2;
         }
     }
 }

@@ -4,6 +4,7 @@ use super::fullscreen::{self, filtered_picture};
 use super::layouts::uniform;
 use super::pipelines::SCENE_FORMAT;
 use super::targets::Targets;
+use super::timing::Pass;
 use super::uniforms;
 use super::upload::entry;
 use glam::Vec3;
@@ -121,9 +122,14 @@ impl Scattering {
     }
 
     /// Records both draws: from the diffuse picture to the scratch one and on to the scattered one.
-    pub fn draw(&self, encoder: &mut wgpu::CommandEncoder, targets: &Targets) {
-        fullscreen::draw(encoder, "scatter across", &self.pipeline, &targets.scatter_groups[0], &targets.scratch);
-        fullscreen::draw(encoder, "scatter up", &self.pipeline, &targets.scatter_groups[1], &targets.scattered);
+    pub fn draw(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        targets: &Targets,
+        [across, up]: [Option<wgpu::RenderPassTimestampWrites<'_>>; 2],
+    ) {
+        fullscreen::draw(encoder, Pass::ScatterAcross, &self.pipeline, &targets.scatter_groups[0], &targets.scratch, across);
+        fullscreen::draw(encoder, Pass::ScatterUp, &self.pipeline, &targets.scatter_groups[1], &targets.scattered, up);
     }
 
     /// Groups of both draws.

@@ -275,7 +275,7 @@ impl GpuWindow {
         switches: &Switches,
     ) -> wgpu::CommandEncoder {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("window") });
-        self.renderer.draw(&self.device, &self.queue, &mut encoder, &self.face.view, self.face.size, &switches.draw, frame);
+        self.renderer.draw(&self.device, &self.queue, &mut encoder, &self.face.view, self.face.size, &switches.draw, frame, None);
         let size = [self.surface_config.width, self.surface_config.height];
         self.painter.paint(&self.device, &self.queue, &mut encoder, target, size, pixels_per_point, primitives);
         encoder

@@ -6,8 +6,8 @@
 mod golden;
 mod probe;
 mod properties;
-mod skin;
 mod read_back;
+mod skin;
 mod twins;
 
 use libtest_mimic::{Arguments, Trial};

@@ -368,4 +368,3 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
     ensure!(num_beyond_four * 10 > cases.len() * 9, "only {num_beyond_four} normals depend on the poses beyond the fourth and on the mask");
     Ok(())
 }
-
