@@ -263,6 +263,9 @@ impl Solver {
         self.skeleton.pose(shown, &mut out.points, &mut out.rotations);
         self.evaluator.evaluate(&out.points, &mut out.influences);
         out.zones.clear();
+        out.zones.resize(self.character.num_zones(), 0.0);
+        out.stretched.clear();
+        out.stretched.resize(self.character.num_zones(), 0.0);
         out.shapes = shown.weights;
         let [x, y, z, right, up, front] = shown.head;
         out.head = HeadPose {

@@ -48,6 +48,7 @@ pub(crate) fn tiny_character() -> Character {
         poses,
         shapes: Vec::new(),
         correctives: Vec::new(),
+        zones: None,
         mode: Mode::Independent,
         group_degenerate: GroupDegenerate::Exclude,
         falloff: 1.0,

@@ -22,6 +22,7 @@ fn face(session: u32, seq: u32, captured_at: i64, x: f32) -> FaceFrame {
         rotations: vec![Quat::IDENTITY, Quat::from_rotation_x(0.4 * x)],
         influences: vec![x, 0.5 * x],
         zones: Vec::new(),
+        stretched: Vec::new(),
         shapes: None,
         head: HeadPose { rotation: Quat::from_rotation_y(0.3 * x), position: Vec3::new(0.0, 0.02 * x, 0.0) },
     }

@@ -161,6 +161,7 @@ pub fn character() -> Arc<Character> {
         poses,
         shapes,
         correctives: Vec::new(),
+        zones: None,
         mode: Mode::Independent,
         group_degenerate: GroupDegenerate::Exclude,
         falloff: 1.0,
