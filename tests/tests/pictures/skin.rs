@@ -26,7 +26,7 @@ fn tone_map(stage: &Stage) -> anyhow::Result<()> {
             [light, light * 0.5, light * 0.25, 1.0]
         })
         .collect();
-    let headless = crate::twins::headless(stage)?;
+    let headless = stage.headless()?;
     let scene = texture(&headless, wgpu::TextureFormat::Rgba32Float, SIZE, &[bytemuck::cast_slice(&lights).to_vec()]);
     let view = scene.create_view(&wgpu::TextureViewDescriptor::default());
     for exposure in [0.5, 1.0, 2.0] {
@@ -81,7 +81,7 @@ fn function_probe(stage: &Stage, call: &str, cases: &[[[f32; 4]; 2]]) -> anyhow:
         groups: &[],
         what: What::Points { layout, bytes: bytemuck::cast_slice(cases), count: cases.len() },
     };
-    run(&*crate::twins::headless(stage)?, &probe)
+    run(&*stage.headless()?, &probe)
 }
 
 fn highlights(stage: &Stage) -> anyhow::Result<()> {
@@ -135,7 +135,7 @@ fn scattering_of_an_edge(stage: &Stage) -> anyhow::Result<()> {
     // The last pixels do not scatter.
     let strength: Vec<f32> = (0..row.len()).map(|x| if x < 90 { 1.0 } else { 0.0 }).collect();
     let masks: Vec<[f32; 4]> = (0..SIZE[1]).flat_map(|_| strength.iter().map(|strength| [0.0, 0.0, 0.0, 1.0 + strength])).collect();
-    let headless = crate::twins::headless(stage)?;
+    let headless = stage.headless()?;
     let [diffuse, specular] = [&texels, &masks].map(|texels| {
         // Half floats hold these values to a part in two thousand.
         let halves: Vec<u8> = texels.iter().flatten().flat_map(|value| half::f16::from_f32(*value).to_le_bytes()).collect();
