@@ -2,7 +2,7 @@
 
 use crate::asset::{AssetError, CharacterAsset};
 use crate::picture_size::parse_size;
-use crate::renderer::{BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode};
+use crate::renderer::{BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode, WrinkleSystem, ZoneBlend};
 use glam::{Quat, Vec3};
 use image::RgbaImage;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -98,6 +98,12 @@ pub struct PictureArgs {
     /// Distance of the camera, 1 frames the head
     #[arg(long, default_value_t = 1.0, value_parser = parse_zoom)]
     pub zoom: f32,
+    /// Whose wrinkles: own (what the character is made for), bones, zones or both
+    #[arg(long, default_value_t = WrinkleSystem::Own)]
+    pub wrinkles: WrinkleSystem,
+    /// How zones' wrinkles are blended: pd, difference or two-maps
+    #[arg(long, default_value_t = ZoneBlend::PartialDerivatives)]
+    pub zone_blend: ZoneBlend,
     /// Set-up of lights: portrait or sunset
     #[arg(long, default_value_t = Studio::Portrait)]
     pub light: Studio,
@@ -183,7 +189,7 @@ impl PictureMaker {
         camera.zoom(args.zoom);
         let view = ViewMode::parse(&args.view, &asset.character)?;
         let settings =
-            DrawSettings { view, blend: args.blend, studio: args.light, key_turn: args.key_turn.to_radians(), ..DrawSettings::new(camera) };
+            DrawSettings { view, blend: args.blend, system: args.wrinkles, zone_blend: args.zone_blend, studio: args.light, key_turn: args.key_turn.to_radians(), ..DrawSettings::new(camera) };
         let headless = Headless::new(&asset)?;
         tracing::info!(adapter = headless.adapter().name, "drawing");
         Ok(Self { asset, headless, settings, size: args.size, supersample: args.supersample })

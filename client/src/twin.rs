@@ -2,6 +2,7 @@
 //! blend, the tone curve. The tests hold these to published and derived numbers, and the GPU to these.
 
 pub mod skin;
+pub mod zones;
 
 use crate::asset::Vertex;
 use crate::renderer::{BlendMode, moves_bone};

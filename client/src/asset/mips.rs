@@ -88,6 +88,11 @@ fn halve(from: &[u8], [width, height]: [u32; 2], [to_width, to_height]: [u32; 2]
                         to.push(quarter(sum));
                     }
                 }
+                Texels::Linear4 => {
+                    for channel in 0..4 {
+                        to.push(quarter(four.iter().map(|texel| u32::from(texel[channel])).sum()));
+                    }
+                }
                 Texels::AlbedoSrgb => {
                     let alpha: f32 = four.iter().map(|texel| f32::from(texel[3])).sum();
                     for channel in 0..3 {

@@ -135,6 +135,11 @@ impl Headless {
         Ok(Some(timer.milliseconds(&stamps)))
     }
 
+    /// Bytes of the zones' masks and of their wrinkle map.
+    pub fn zone_bytes(&self) -> u64 {
+        self.renderer.zone_bytes()
+    }
+
     /// Draw calls of the last picture.
     pub fn num_draws(&self) -> u32 {
         self.renderer.num_draws()
@@ -194,13 +199,18 @@ async fn open_device(choice: AdapterChoice) -> Result<(wgpu::AdapterInfo, wgpu::
     let (device, queue) = adapter
         .request_device(&wgpu::DeviceDescriptor {
             label: Some("rhytid headless"),
-            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_features: optional_features(&adapter) | (adapter.features() & wgpu::Features::TIMESTAMP_QUERY),
             required_limits: required_limits(&adapter),
             ..Default::default()
         })
         .await
         .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
     Ok((info, device, queue))
+}
+
+/// What the renderer uses where an adapter has it.
+pub fn optional_features(adapter: &wgpu::Adapter) -> wgpu::Features {
+    adapter.features() & wgpu::Features::TEXTURE_COMPRESSION_BC
 }
 
 /// What WebGL2 guarantees, with textures as large as the adapter has them.

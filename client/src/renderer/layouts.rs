@@ -48,6 +48,10 @@ impl Layouts {
                 uniform(2, Stages::VERTEX_FRAGMENT, size_of::<uniforms::PoseTable>()),
                 binding(3, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
                 binding(4, Stages::FRAGMENT, sampler),
+                binding(7, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
+                binding(8, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
+                binding(9, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),
+                uniform(10, Stages::FRAGMENT, size_of::<uniforms::ZoneWeights>()),
             ],
         );
         let map = |at| binding(at, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2));

@@ -6,7 +6,7 @@ use super::painter::Painter;
 use super::panel::{self, Scene};
 use super::switches::Switches;
 use crate::asset::CharacterAsset;
-use crate::renderer::{RenderError, RenderFrame, Renderer, read_back, required_limits};
+use crate::renderer::{RenderError, RenderFrame, Renderer, optional_features, read_back, required_limits};
 use image::RgbaImage;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -68,7 +68,7 @@ impl GpuWindow {
             .map_err(|error| RenderError::NoAdapter(error.to_string()))?;
         let info = adapter.get_info();
         let descriptor =
-            wgpu::DeviceDescriptor { label: Some("rhytid window"), required_limits: required_limits(&adapter), ..Default::default() };
+            wgpu::DeviceDescriptor { label: Some("rhytid window"), required_features: optional_features(&adapter), required_limits: required_limits(&adapter), ..Default::default() };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
 

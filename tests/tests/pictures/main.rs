@@ -9,6 +9,7 @@ mod properties;
 mod read_back;
 mod skin;
 mod twins;
+mod zones;
 
 use libtest_mimic::{Arguments, Trial};
 use rhytid_client::renderer::AdapterChoice;
@@ -65,6 +66,7 @@ fn main() -> ExitCode {
     };
     twins::add(&mut add);
     skin::add(&mut add);
+    zones::add(&mut add);
     properties::add(&mut add);
     golden::add(&mut add);
     libtest_mimic::run(&arguments, trials).exit_code()
