@@ -2,7 +2,9 @@
 
 use crate::asset::{AssetError, CharacterAsset};
 use crate::picture_size::parse_size;
-use crate::renderer::{BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode, WrinkleSystem, ZoneBlend};
+use crate::renderer::{
+    BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode, WrinkleSystem, ZoneBlend,
+};
 use glam::{Quat, Vec3};
 use image::RgbaImage;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -188,8 +190,15 @@ impl PictureMaker {
         camera.orbit(args.orbit[0].to_radians(), args.orbit[1].to_radians());
         camera.zoom(args.zoom);
         let view = ViewMode::parse(&args.view, &asset.character)?;
-        let settings =
-            DrawSettings { view, blend: args.blend, system: args.wrinkles, zone_blend: args.zone_blend, studio: args.light, key_turn: args.key_turn.to_radians(), ..DrawSettings::new(camera) };
+        let settings = DrawSettings {
+            view,
+            blend: args.blend,
+            system: args.wrinkles,
+            zone_blend: args.zone_blend,
+            studio: args.light,
+            key_turn: args.key_turn.to_radians(),
+            ..DrawSettings::new(camera)
+        };
         let headless = Headless::new(&asset)?;
         tracing::info!(adapter = headless.adapter().name, "drawing");
         Ok(Self { asset, headless, settings, size: args.size, supersample: args.supersample })

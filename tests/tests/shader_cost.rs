@@ -9,9 +9,7 @@ use std::process::{Command, ExitCode};
 
 fn main() -> ExitCode {
     let is_here = Command::new("spirv-opt").arg("--version").output().is_ok();
-    let trial = Trial::test("zones_add_at_most_nine_instructions_and_three_reads", || {
-        zones().map_err(|error| format!("{error:#}").into())
-    });
+    let trial = Trial::test("zones_add_at_most_nine_instructions_and_three_reads", || zones().map_err(|error| format!("{error:#}").into()));
     libtest_mimic::run(&Arguments::from_args(), vec![trial.with_ignored_flag(!is_here)]).exit_code()
 }
 
@@ -37,8 +35,7 @@ fn count(zones: u32) -> anyhow::Result<Count> {
     let info = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::empty()).validate(&module)?;
     let constants = [("ZONES", f64::from(zones)), ("POSES", 0.0)].map(|(name, value)| (name.to_owned(), value));
     let entry = (naga::ShaderStage::Fragment, "fs_wrinkled");
-    let (module, info) =
-        naga::back::pipeline_constants::process_overrides(&module, &info, Some(entry), &constants.into_iter().collect())?;
+    let (module, info) = naga::back::pipeline_constants::process_overrides(&module, &info, Some(entry), &constants.into_iter().collect())?;
     let pipeline = naga::back::spv::PipelineOptions { shader_stage: entry.0, entry_point: entry.1.to_owned() };
     let words = naga::back::spv::write_vec(&module, &info, &naga::back::spv::Options::default(), Some(&pipeline))?;
     let folder = tempfile::tempdir()?;

@@ -163,7 +163,8 @@ impl Uploader<'_> {
             maps.create_view(&wgpu::TextureViewDescriptor { dimension: Some(wgpu::TextureViewDimension::D2Array), ..Default::default() });
         let sampler = self.map_sampler("wrinkle sampler");
         let zone_weights = self.uniform("zone weights", size_of::<uniforms::ZoneWeights>());
-        let (no_mask, no_difference) = (MipChain::uniform([1, 1], Texels::Linear4, &[0; 4]), MipChain::uniform([1, 1], Texels::Linear4, &[128; 4]));
+        let (no_mask, no_difference) =
+            (MipChain::uniform([1, 1], Texels::Linear4, &[0; 4]), MipChain::uniform([1, 1], Texels::Linear4, &[128; 4]));
         let before = self.bytes;
         let (masks, zone_maps, difference) = match &asset.zones {
             Some(zones) => {
@@ -180,7 +181,8 @@ impl Uploader<'_> {
         let array = |texture: &wgpu::Texture| {
             texture.create_view(&wgpu::TextureViewDescriptor { dimension: Some(wgpu::TextureViewDimension::D2Array), ..Default::default() })
         };
-        let (masks, zone_maps, difference) = (array(&masks), array(&zone_maps), difference.create_view(&wgpu::TextureViewDescriptor::default()));
+        let (masks, zone_maps, difference) =
+            (array(&masks), array(&zone_maps), difference.create_view(&wgpu::TextureViewDescriptor::default()));
         let group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("character"),
             layout: &layouts.character,

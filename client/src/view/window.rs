@@ -67,8 +67,12 @@ impl GpuWindow {
         let adapter = pollster::block_on(wgpu::util::initialize_adapter_from_env_or_default(&instance, Some(&surface)))
             .map_err(|error| RenderError::NoAdapter(error.to_string()))?;
         let info = adapter.get_info();
-        let descriptor =
-            wgpu::DeviceDescriptor { label: Some("rhytid window"), required_features: optional_features(&adapter), required_limits: required_limits(&adapter), ..Default::default() };
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("rhytid window"),
+            required_features: optional_features(&adapter),
+            required_limits: required_limits(&adapter),
+            ..Default::default()
+        };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
 
@@ -124,6 +128,11 @@ impl GpuWindow {
     /// The window alone; everything on the device is dropped.
     pub(super) fn into_window(self) -> Arc<Window> {
         self.window
+    }
+
+    /// Bytes of the zones' masks and of their wrinkle map.
+    pub(super) fn zone_bytes(&self) -> u64 {
+        self.renderer.zone_bytes()
     }
 
     /// The window itself.

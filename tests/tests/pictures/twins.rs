@@ -183,8 +183,13 @@ fn influences(stage: &Stage) -> anyhow::Result<()> {
         let coefficients: Vec<f32> = (0..num_poses * character.num_bones()).map(|_| sequence.next(0.0, 1.0)).collect();
         let frame = RenderFrame { influences: coefficients.clone(), ..RenderFrame::at_rest(&character) };
         let without_falloff = Character { falloff: 1.0, ..character.clone() };
-        let asset =
-            CharacterAsset { character: Arc::new(character), primitives: Vec::new(), palette: stage.asset.palette.clone(), wrinkles: None, zones: None };
+        let asset = CharacterAsset {
+            character: Arc::new(character),
+            primitives: Vec::new(),
+            palette: stage.asset.palette.clone(),
+            wrinkles: None,
+            zones: None,
+        };
         let halves = (0..num_poses.div_ceil(4) as u32)
             .map(|half| probe_skinning(stage, &asset, &frame, &vertices, 3 + half))
             .collect::<anyhow::Result<Vec<_>>>()?;
