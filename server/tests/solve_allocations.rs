@@ -5,7 +5,8 @@ mod solve_fixture;
 use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::FaceFrame;
 use rhytid_shared::layout::Layout;
-use solve_fixture::{character, feed, hello, weight_frame};
+use rhytid_shared::limits::MAX_EXPRESSIONS;
+use solve_fixture::{character_with_zones, feed, hello, weight_frame};
 use std::alloc::{GlobalAlloc, Layout as MemoryLayout, System};
 use std::cell::Cell;
 
@@ -40,7 +41,7 @@ static ALLOCATOR: Counting = Counting;
 
 #[test]
 fn frames_allocate_nothing() {
-    let character = character();
+    let character = character_with_zones();
     let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(Some(Layout::Ibug68), None)).expect("a good session");
     let mut out = FaceFrame::at_rest(&character);
     // Only a new neutral may: it is trained on, five times in the first minute and a half.
@@ -62,4 +63,15 @@ fn frames_allocate_nothing() {
         solver.solve(frame, &mut out).expect("a good frame");
     }
     assert_eq!(NUM_ALLOCATIONS.get(), before);
+    // Weights drove the zones; expressions do in their stead.
+    let mut frames = weights.clone();
+    for (i, frame) in frames.iter_mut().enumerate() {
+        (frame.t, frame.expressions) = (1.0 + i as f64 * 0.02, Some([0.5; MAX_EXPRESSIONS]));
+    }
+    let before = NUM_ALLOCATIONS.get();
+    for frame in &frames {
+        solver.solve(frame, &mut out).expect("a good frame");
+    }
+    assert_eq!(NUM_ALLOCATIONS.get(), before);
+    assert!(out.zones[0] > 0.5);
 }

@@ -2,6 +2,7 @@
 
 use super::config::LostConfig;
 use super::weights_to_bones::Weights;
+use super::zones::Amounts;
 use glam::Vec3;
 use rhytid_shared::NUM_ARKIT_SHAPES;
 
@@ -13,13 +14,15 @@ pub(super) struct FaceState {
     /// Rotation vector, then position in metres.
     pub(super) head: [f64; 6],
     pub(super) weights: Option<Weights>,
+    /// Expressions, where something is known of them; else influences drive the wrinkle zones.
+    pub(super) expressions: Option<Amounts>,
     /// True where every motion is a displacement, of turning bones, too: an animator's own bones.
     pub(super) is_placed: bool,
 }
 
 impl FaceState {
     pub(super) fn at_rest(num_bones: usize) -> Self {
-        Self { motions: vec![Vec3::ZERO; num_bones], head: [0.0; 6], weights: None, is_placed: false }
+        Self { motions: vec![Vec3::ZERO; num_bones], head: [0.0; 6], weights: None, expressions: None, is_placed: false }
     }
 
     /// `self = a * share`.
@@ -31,10 +34,11 @@ impl FaceState {
             self.head[axis] = a.head[axis] * share;
         }
         self.weights = a.weights.map(|weights| weights.map(|weight| weight * share as f32));
+        self.expressions = a.expressions.map(|amounts| amounts.map(|halves| halves.map(|amount| amount * share as f32)));
         self.is_placed = a.is_placed;
     }
 
-    /// `self += b * share`; weights only where both have them.
+    /// `self += b * share`; weights and expressions only where both have them.
     fn add_scaled(&mut self, b: &Self, share: f64) {
         for (to, from) in self.motions.iter_mut().zip(&b.motions) {
             *to += *from * share as f32;
@@ -45,6 +49,11 @@ impl FaceState {
         if let (Some(to), Some(from)) = (&mut self.weights, &b.weights) {
             for shape in 0..NUM_ARKIT_SHAPES {
                 to[shape] += from[shape] * share as f32;
+            }
+        }
+        if let (Some(to), Some(from)) = (&mut self.expressions, &b.expressions) {
+            for (to, from) in to.iter_mut().flatten().zip(from.iter().flatten()) {
+                *to += from * share as f32;
             }
         }
     }

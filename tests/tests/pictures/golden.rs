@@ -104,7 +104,7 @@ fn session_frame(character: &Arc<Character>, index: usize) -> anyhow::Result<Fac
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/assets/demo.ibug68.jsonl");
     let mut feed = Feed::open(&path, character)?;
     let mut pipeline = Pipeline::new(Arc::clone(character), &SolveConfig::default(), &feed.hello, 1)?;
-    let mut frame = TrackingFrame { t: 0.0, data: TrackingData::NoFace };
+    let mut frame = TrackingFrame::new(0.0, TrackingData::NoFace);
     let (mut packet, mut num_frames) = (Vec::new(), 0);
     while let Some(item) = feed.next_frame(&mut frame)? {
         ensure!(item == FeedItem::Frame, "the built-in session holds frames only");
