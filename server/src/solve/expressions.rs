@@ -114,7 +114,8 @@ mod tests {
     #[test]
     fn each_expression_is_read_from_its_shapes_in_each_half() {
         use Emotion::{Anger, Disgust, Fear, Joy, Sad, Surprise};
-        let cases: [(Emotion, &[(&str, f32)], [f32; 2]); 8] = [
+        type Case<'a> = (Emotion, &'a [(&'a str, f32)], [f32; 2]);
+        let cases: [Case; 8] = [
             (Joy, &[("mouthSmileLeft", 0.8), ("cheekSquintLeft", 1.0), ("mouthSmileRight", 0.5)], [1.0, 0.5]),
             (Surprise, &[("browInnerUp", 1.0), ("browOuterUpRight", 1.0), ("jawOpen", 0.4)], [0.35, 0.6]),
             (Fear, &[("browInnerUp", 0.7), ("eyeWideLeft", 0.5), ("mouthStretchLeft", 0.25)], [0.75, 0.0]),
