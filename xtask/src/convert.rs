@@ -90,7 +90,7 @@ pub fn run(conversion: &Conversion) -> Result<()> {
     let mut out = RgbImage::new(side.0, side.1);
     for (texel, pixel) in texels.iter().zip(out.pixels_mut()) {
         *pixel = Rgb(match conversion.to {
-            Form::Normals => loss.count(texel, texel.wrinkled, |value| forms::normal_of(value)),
+            Form::Normals => loss.count(texel, texel.wrinkled, forms::normal_of),
             Form::Derivatives => {
                 let [red, green, _] = loss.count(texel, (texel.derivatives() / scale).extend(0.0), |value| {
                     forms::from_derivatives(value.truncate() * scale, texel.base)
