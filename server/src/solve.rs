@@ -5,6 +5,8 @@
 //! correctives, or an animator's own bones) → each bone's motion → eased over lost faces and new neutrals → evaluated
 //! points, rotations and influences → wrinkle zones (expressions given or read from weights, else the influences).
 
+#![deny(clippy::disallowed_methods)]
+
 mod calibration;
 mod config;
 mod depth;
@@ -20,6 +22,7 @@ mod landmark_session;
 mod landmarks_to_bones;
 mod lids;
 mod linear;
+mod lower_face;
 mod points;
 mod rbf;
 mod rotation;
@@ -43,7 +46,7 @@ pub use error::SolveError;
 use easing::{Easing, FaceState};
 use evaluate::Evaluator;
 use landmark_session::LandmarkSession;
-use rhytid_shared::limits::MAX_SECONDS;
+use rhytid_shared::limits::{MAX_EXPRESSIONS, MAX_SECONDS};
 use rhytid_shared::{Character, FaceFrame, HeadPose, PublishHello, TrackingData, TrackingFrame};
 use serde::Serialize;
 use skeleton::Skeleton;
@@ -53,6 +56,9 @@ use zones::ZoneRig;
 
 /// Largest amount of an expression: as of a weight, some overshoot on strong faces.
 const LARGEST_AMOUNT: f32 = 1.2;
+
+/// Frames nearer to each other than a packet's clock can tell, seconds, are one.
+const SHORTEST_STEP: f64 = 1e-6;
 
 /// What a publisher is told when a neutral has been reached.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -151,7 +157,7 @@ impl Solver {
     ) -> Result<Self, SolveError> {
         let mut solver = Self::new(character, config, hello)?;
         let num_points = solver.landmarks.as_ref().map_or(0, LandmarkSession::num_points);
-        if let Some(problem) = calibration.problem(num_points) {
+        if let Some(problem) = calibration.problem(num_points, solver.character.head_pivot.as_dvec3()) {
             return Err(SolveError::BadCalibration { problem });
         }
         match &mut solver.landmarks {
@@ -165,22 +171,21 @@ impl Solver {
         Ok(solver)
     }
 
-    /// Takes the neutral now: the face of the last moments or, before any face, of the first ones to come.
+    /// Takes the neutral now: the face of the last moments or, before any face, of the first ones to come, whatever they come
+    /// as.
     pub fn calibrate(&mut self) {
-        let landmarks = match self.last_source {
-            Some(Source::Landmarks) | None => self.landmarks.as_mut(),
-            Some(Source::Weights | Source::Bones) => None,
-        };
-        if let Some(landmarks) = landmarks {
-            if landmarks.calibrate(&self.character, self.last_t) {
-                self.blend = Some(self.config.calibration.blend);
-                self.report = landmarks.calibration().map(report_of);
-            }
-            return;
-        }
         self.is_wanted = true;
-        if let (Some(t), Some(_)) = (self.last_t, self.last_source) {
-            self.calibrate_sent(t);
+        match (self.last_t, self.last_source) {
+            (Some(t), Some(Source::Weights | Source::Bones)) => self.calibrate_sent(t),
+            _ => {
+                if let Some(landmarks) = &mut self.landmarks
+                    && landmarks.calibrate(&self.character, self.last_t)
+                {
+                    self.blend = Some(self.config.calibration.blend);
+                    self.report = landmarks.calibration().map(report_of);
+                    self.is_wanted = false;
+                }
+            }
         }
     }
 
@@ -193,6 +198,9 @@ impl Solver {
         self.sent_calibration = Some(calibration);
         self.blend = Some(self.config.calibration.blend);
         self.is_wanted = false;
+        if let Some(landmarks) = &mut self.landmarks {
+            landmarks.withdraw();
+        }
     }
 
     /// Solves one frame into `out`, whose buffers are reused; `session` is left to the caller, `seq` counts solved frames.
@@ -202,7 +210,7 @@ impl Solver {
         if !(0.0..=MAX_SECONDS).contains(&t) {
             return Err(SolveError::TimeRange { got: t });
         }
-        if let Some(previous) = self.last_t.filter(|previous| t <= *previous) {
+        if let Some(previous) = self.last_t.filter(|previous| t - previous < SHORTEST_STEP) {
             return Err(SolveError::Time { got: t, previous });
         }
         let source = self.aim(frame)?;
@@ -210,6 +218,13 @@ impl Solver {
         out.face = source.is_some();
         match source {
             Some(source) => {
+                if self.last_source.is_some_and(|last| last != source) {
+                    // Another source sees another face: as with a new neutral, there is a way from one to the other.
+                    self.blend = Some(self.config.calibration.blend);
+                }
+                if self.easing.shown().is_placed != self.target.is_placed {
+                    self.easing.convert(|shown| self.skeleton.convert(shown, self.target.is_placed));
+                }
                 self.last_source = Some(source);
                 self.easing.show(t, &self.target, self.blend.take());
                 if self.is_wanted && source != Source::Landmarks {
@@ -239,11 +254,13 @@ impl Solver {
         }
         let source = self.aim_bones(frame.t, &frame.data)?;
         // What the publisher says of expressions counts before what weights say.
-        self.target.expressions = match (&frame.expressions, &self.target.weights, &self.zones) {
+        let known = match (&frame.expressions, &self.target.weights, &self.zones) {
             (Some(amounts), _, _) => Some(ZoneRig::given(amounts)),
             (None, Some(weights), Some(zones)) => zones.read(weights),
             _ => None,
         };
+        self.target.bridge = if known.is_none() { 1.0 } else { 0.0 };
+        self.target.expressions = known.unwrap_or([[0.0; 2]; MAX_EXPRESSIONS]);
         Ok(source)
     }
 
@@ -259,6 +276,7 @@ impl Solver {
                 }
                 if solved.is_to_report {
                     self.report = landmarks.calibration().map(report_of);
+                    self.is_wanted &= !self.report.is_some_and(|report| report.requested);
                 }
                 Ok(Some(Source::Landmarks))
             }
@@ -290,7 +308,7 @@ impl Solver {
         out.zones.resize(self.character.num_zones(), 0.0);
         out.stretched.resize(self.character.num_zones(), 0.0);
         if let Some(zones) = &self.zones {
-            zones.write(shown.expressions.as_ref(), &out.influences, &mut out.zones, &mut out.stretched);
+            zones.write(&shown.expressions, shown.bridge, &out.influences, &mut out.zones, &mut out.stretched);
         }
         out.shapes = shown.weights;
         let [x, y, z, right, up, front] = shown.head;

@@ -81,7 +81,7 @@ fn zones_follow_what_a_publisher_says_of_expressions() {
     for (text, zones, stretched) in [
         (r#"{"type":"frame","t":1,"expressions":{"surprise":1,"anger":1}}"#, [0.2, 0.2, 0.0, 0.0, 0.8, 0.8, 1.0, 0.0], [0.0; 8]),
         (
-            r#"{"type":"frame","t":2,"expressions":{"anger":1},"weights":{"mouthSmileLeft":1}}"#,
+            r#"{"type":"frame","t":2,"expressions":{"anger":1},"bones":{}}"#,
             [0.0, 0.0, 0.0, 0.0, 0.8, 0.8, 1.0, 0.0],
             [0.6, 0.6, 0.8, 0.8, 0.0, 0.0, 0.0, 0.0],
         ),
@@ -179,6 +179,22 @@ fn zones_of_a_lost_face_are_held_and_eased_like_its_bones() {
         }
         assert!((last - seen).abs() < 0.05, "source {source}: {last} was {seen}");
     }
+}
+
+#[test]
+fn zones_do_not_jump_where_another_source_takes_over() {
+    let mut session = Session::calibrated();
+    for _ in 0..60 {
+        session.landmarks([0.009, 0.009]);
+    }
+    let mut last = session.out.zones[RED];
+    assert!(last > 0.5);
+    for frame in 0..40 {
+        let now = session.weights(&[]).zones[RED];
+        assert!((now - last).abs() < 0.15, "frame {frame}: {last} then {now}");
+        last = now;
+    }
+    assert_eq!(last, 0.0);
 }
 
 #[test]

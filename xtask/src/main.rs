@@ -8,7 +8,7 @@ mod setup;
 use anyhow::{Context, Result, ensure};
 use clap::{Parser, Subcommand};
 use std::path::PathBuf;
-use std::process::Command;
+use std::process::{Command, ExitCode};
 
 #[derive(Parser)]
 #[command(about = "Rhytid's developer commands")]
@@ -35,13 +35,20 @@ enum Task {
     Convert(convert::Conversion),
 }
 
-fn main() -> Result<()> {
-    match Arguments::parse().command {
+fn main() -> ExitCode {
+    let result = match Arguments::parse().command {
         Task::Demo => demo::run(),
         Task::Test { arguments } => test(&arguments),
         Task::Setup => setup::run(),
         Task::Bake => bake::run(),
         Task::Convert(conversion) => convert::run(&conversion),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
     }
 }
 

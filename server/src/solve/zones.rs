@@ -56,16 +56,14 @@ impl ZoneRig {
         is_known.then_some(amounts)
     }
 
-    /// Writes how strongly each zone shows and how far it is stretched, both in `[0, 1]`; by the influences (pose-major) where
-    /// nothing is known of expressions.
-    pub(super) fn write(&self, amounts: Option<&Amounts>, influences: &[f32], zones: &mut [f32], stretched: &mut [f32]) {
+    /// Writes how strongly each zone shows and how far it is stretched, both in `[0, 1]`: by expressions, and by the influences
+    /// (pose-major) times `bridge`.
+    pub(super) fn write(&self, amounts: &Amounts, bridge: f32, influences: &[f32], zones: &mut [f32], stretched: &mut [f32]) {
         let mut sums = [0.0_f32; MAX_ZONES];
-        match amounts {
-            Some(amounts) => self.sum_expressions(amounts, &mut sums),
-            None => {
-                for row in &self.bridge {
-                    sums[row.zone] += row.gain * influences[row.pose * self.num_bones + row.bone];
-                }
+        self.sum_expressions(amounts, &mut sums);
+        if bridge != 0.0 {
+            for row in &self.bridge {
+                sums[row.zone] += bridge * row.gain * influences[row.pose * self.num_bones + row.bone];
             }
         }
         for (zone, sum) in zones.iter_mut().zip(sums) {
@@ -121,7 +119,7 @@ mod tests {
         let mut amounts = [[0.0; 2]; MAX_EXPRESSIONS];
         expressions.iter().for_each(|&(row, left, right)| amounts[row] = [left, right]);
         let (mut zones, mut stretched) = ([9.0; 8], [9.0; 8]);
-        rig.write(Some(&amounts), &[], &mut zones, &mut stretched);
+        rig.write(&amounts, 0.0, &[], &mut zones, &mut stretched);
         (zones, stretched)
     }
 
@@ -172,9 +170,9 @@ mod tests {
         let bridge = vec![row(0, 0, 0, 0.5), row(0, 1, 0, 0.5), row(1, 2, 0, -1.0), row(1, 2, 6, 2.0)];
         let rig = ZoneRig { bridge, num_bones: 3, can_stretch: true, ..paper() };
         let (mut zones, mut stretched) = ([9.0; 8], [9.0; 8]);
-        rig.write(None, &[0.8, 0.4, 0.0, 0.0, 0.0, 0.25], &mut zones, &mut stretched);
+        rig.write(&[[0.0; 2]; MAX_EXPRESSIONS], 1.0, &[0.8, 0.4, 0.0, 0.0, 0.0, 0.25], &mut zones, &mut stretched);
         assert_near(zones, [0.35, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0]);
-        rig.write(None, &[0.0, 0.0, 0.0, 0.0, 0.0, 0.75], &mut zones, &mut stretched);
+        rig.write(&[[0.0; 2]; MAX_EXPRESSIONS], 1.0, &[0.0, 0.0, 0.0, 0.0, 0.0, 0.75], &mut zones, &mut stretched);
         assert_near(zones, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
         assert_near(stretched, [0.75, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
     }

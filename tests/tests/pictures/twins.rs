@@ -8,11 +8,11 @@ use rhytid_client::asset::Vertex;
 use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
 use rhytid_client::renderer::{VERTEX_LAYOUT, bone_major, pose_table, uniforms};
 use rhytid_client::twin::{self, WrinkleSample};
-use rhytid_client::{BlendMode, CharacterAsset, Headless, RenderFrame};
+use rhytid_client::{BlendMode, CharacterAsset, RenderFrame};
 use rhytid_shared::character::Pose;
 use rhytid_shared::limits::MAX_POSES;
 use rhytid_shared::{Character, TrackingData};
-use std::sync::{Arc, MutexGuard};
+use std::sync::Arc;
 
 /// Puts `value` of vertex `index` into pixel `index`; WHICH chooses the value.
 const SKINNING_PROBE: &str = "
@@ -97,10 +97,6 @@ impl Sequence {
     }
 }
 
-fn headless(stage: &Stage) -> anyhow::Result<MutexGuard<'_, Headless>> {
-    stage.headless.lock().map_err(|_| anyhow::anyhow!("another test broke the renderer"))
-}
-
 /// A frame in which everything moves: brows, jaw, head.
 fn moving_frame(stage: &Stage) -> anyhow::Result<RenderFrame> {
     let character = &stage.asset.character;
@@ -145,7 +141,7 @@ fn probe_skinning(
         )],
         what: What::Points { layout: VERTEX_LAYOUT, bytes: bytemuck::cast_slice(vertices), count: vertices.len() },
     };
-    run(&*headless(stage)?, &probe)
+    run(&*stage.headless()?, &probe)
 }
 
 fn skinning(stage: &Stage) -> anyhow::Result<()> {
@@ -247,7 +243,7 @@ fn blend(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
         groups: &[],
         what: What::Points { layout, bytes: bytemuck::cast_slice(&cases), count: cases.len() },
     };
-    let read = run(&*headless(stage)?, &probe)?;
+    let read = run(&*stage.headless()?, &probe)?;
     let other = BlendMode::ALL[(number + 1) % BlendMode::ALL.len()];
     let mut num_apart = 0;
     for (case, read) in cases.iter().zip(read) {
@@ -312,7 +308,7 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
         step_mode: wgpu::VertexStepMode::Vertex,
         attributes: &wgpu::vertex_attr_array![0 => Float32x2, 1 => Float32x3, 2 => Float32x4, 3 => Float32x4, 4 => Float32x4],
     };
-    let headless = headless(stage)?;
+    let headless = stage.headless()?;
     let view = |layers: &[Vec<u8>], dimension| {
         let side = MAP_SIDE as u32;
         texture(&headless, wgpu::TextureFormat::Rg8Unorm, [side, side], layers)
@@ -380,7 +376,7 @@ fn tone_map(stage: &Stage) -> anyhow::Result<()> {
             [light, light * 0.5, light * 0.25, 1.0]
         })
         .collect();
-    let headless = headless(stage)?;
+    let headless = stage.headless()?;
     let scene = texture(&headless, wgpu::TextureFormat::Rgba32Float, SIZE, &[bytemuck::cast_slice(&lights).to_vec()]);
     let view = scene.create_view(&wgpu::TextureViewDescriptor::default());
     for exposure in [0.5, 1.0, 2.0] {
