@@ -277,7 +277,7 @@ pub fn solve_one(character: &Arc<Character>, data: TrackingData) -> std::result:
     let hello = PublishHello { source: "still".into(), fps: None, layout: None, image: None, focal: None, takeover: false };
     let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
     let mut solved = FaceFrame::at_rest(character);
-    solver.solve(&TrackingFrame { t: 0.0, data }, &mut solved)?;
+    solver.solve(&TrackingFrame::new(0.0, data), &mut solved)?;
     Ok(solved)
 }
 

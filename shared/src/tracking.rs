@@ -5,6 +5,7 @@ mod reader;
 
 use crate::face::HeadPose;
 use crate::layout::Layout;
+use crate::limits::MAX_EXPRESSIONS;
 use crate::names::NUM_ARKIT_SHAPES;
 use glam::Vec3;
 
@@ -34,6 +35,9 @@ pub struct TrackingFrame {
     pub t: f64,
     /// What the tracker saw.
     pub data: TrackingData,
+    /// Amounts of the character's expressions in `[0, 1.2]` where the sender gives them, in the order of its table; those not
+    /// named and those past the table's end are 0. They drive wrinkle zones and move no bone.
+    pub expressions: Option<[f32; MAX_EXPRESSIONS]>,
 }
 
 /// What a tracker saw in one frame.
@@ -64,9 +68,16 @@ pub enum TrackingData {
     NoFace,
 }
 
+impl TrackingFrame {
+    /// A frame whose sender gives no expressions.
+    pub fn new(t: f64, data: TrackingData) -> Self {
+        Self { t, data, expressions: None }
+    }
+}
+
 impl Default for TrackingFrame {
     fn default() -> Self {
-        Self { t: 0.0, data: TrackingData::NoFace }
+        Self::new(0.0, TrackingData::NoFace)
     }
 }
 

@@ -30,6 +30,7 @@ mod surface;
 mod teeth;
 mod uv;
 mod weights;
+mod zones;
 
 use anyhow::{Context, Result, ensure};
 use bust::Region;

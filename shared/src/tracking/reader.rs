@@ -29,9 +29,11 @@ pub struct PublishReader {
 
 /// What a character calls its parts.
 #[derive(Debug, Clone)]
-struct Names {
-    bones: BTreeMap<String, usize>,
+pub(super) struct Names {
+    pub(super) bones: BTreeMap<String, usize>,
     features: BTreeSet<String>,
+    /// In the order of its table; empty for a character without wrinkle zones.
+    pub(super) expressions: Vec<String>,
 }
 
 impl PublishReader {
@@ -40,19 +42,20 @@ impl PublishReader {
         let names = Names {
             bones: character.bones.iter().enumerate().map(|(i, bone)| (bone.name.clone(), i)).collect(),
             features: character.features.keys().cloned().collect(),
+            expressions: character.zones.iter().flat_map(|zones| &zones.expressions).map(|row| row.name.clone()).collect(),
         };
         Self { names: Some(names), fields: Fields::new(), hello: None, last_t: None, t_before: None }
     }
 
-    /// A reader for a sender, which does not know the character at the other end: names of bones and of feature points are
-    /// not checked, and the bones of a frame are left out.
+    /// A reader for a sender, which does not know the character at the other end: names of bones, of
+    /// feature points and of expressions are not checked, and the bones and expressions of a frame are left out.
     pub fn for_any_character() -> Self {
         Self { names: None, fields: Fields::new(), hello: None, last_t: None, t_before: None }
     }
 
     /// Reads one message. A frame is written into `frame`, whose buffers are reused; after an error `frame` is as it was.
     pub fn read(&mut self, text: &str, frame: &mut TrackingFrame) -> Result<PublishMessage, MessageError> {
-        self.fields.read(text, self.names.as_ref().map(|names| &names.bones))?;
+        self.fields.read(text, self.names.as_ref())?;
         if let Some(problem) = self.fields.problem.take() {
             return Err(problem);
         }
@@ -148,7 +151,19 @@ impl PublishReader {
                     *slot = head;
                 }
             }
-            (false, false, false) => return Err(missing("landmarks", "landmarks, weights, bones or \"face\":false in a frame")),
+            (false, false, false) if fields.has_expressions => {
+                if self.names.as_ref().is_some_and(|names| names.expressions.is_empty()) {
+                    return Err(MessageError::new(
+                        "no_expressions",
+                        "frame has only the field expressions, and this character has none, expected landmarks, weights or bones",
+                    ));
+                }
+                // A face at rest, to wrinkle by expressions alone.
+                frame.data = TrackingData::Bones { points: Vec::new(), head };
+            }
+            (false, false, false) => {
+                return Err(missing("landmarks", "landmarks, weights, bones, expressions or \"face\":false in a frame"));
+            }
             _ => {
                 return Err(MessageError::new(
                     "ambiguous_frame",
@@ -156,6 +171,9 @@ impl PublishReader {
                 ));
             }
         }
+        // A character without a table has no use for them; what came with them still counts.
+        let has_table = self.names.as_ref().is_some_and(|names| !names.expressions.is_empty());
+        frame.expressions = (has_table && fields.has_expressions && fields.face != Some(false)).then_some(fields.expressions);
         frame.t = t;
         self.t_before = self.last_t.replace(t);
         Ok(())
@@ -324,7 +342,7 @@ mod tests {
                 "field t: invalid type: string \"2\", expected a number (seconds",
             ),
             (r#"{"type":"frame","landmarks":[[1,2],[3,4]]}"#, "missing_field", "field t is missing"),
-            (r#"{"type":"frame","t":2}"#, "missing_field", "landmarks, weights, bones or \"face\":false"),
+            (r#"{"type":"frame","t":2}"#, "missing_field", "landmarks, weights, bones, expressions or \"face\":false"),
             (r#"{"t":2,"face":false}"#, "missing_field", "field type"),
             (r#"{"type":"settings","t":2}"#, "unknown_type", "\"settings\""),
             (r#"{"type":"frame","t":1,"face":false}"#, "time_order", "field t is 1, expected more than the 1"),
@@ -360,6 +378,65 @@ mod tests {
             assert_eq!(frame, before, "{text}");
         }
         reader.read(r#"{"type":"frame","t":1.01,"face":false}"#, &mut frame).unwrap();
+    }
+
+    #[test]
+    fn expressions_come_with_anything_or_alone() {
+        let mut character = tiny_character();
+        character.zones = Some(crate::testing::one_zone(&["joy", "surprise"]));
+        let mut reader = PublishReader::new(&character);
+        let mut frame = TrackingFrame::default();
+        reader.read(HELLO, &mut frame).unwrap();
+        let mut given = |text: &str| {
+            assert_eq!(reader.read(text, &mut frame), Ok(PublishMessage::Frame), "{text}");
+            (frame.data.clone(), frame.expressions.map(|amounts| [amounts[0], amounts[1], amounts[2]]))
+        };
+        let (data, expressions) = given(r#"{"type":"frame","t":1,"landmarks":[[1,2],[3,4]],"expressions":{"surprise":0.8}}"#);
+        assert!(matches!(data, TrackingData::Landmarks { .. }));
+        assert_eq!(expressions, Some([0.0, 0.8, 0.0]));
+        let (data, expressions) = given(r#"{"type":"frame","t":2,"expressions":{"joy":1.2,"surprise":0},"weights":{"jawOpen":1}}"#);
+        assert!(matches!(data, TrackingData::Weights { .. }));
+        assert_eq!(expressions, Some([1.2, 0.0, 0.0]));
+        // Alone: the face at rest. An empty list is a face without any expression, not one that says nothing of them.
+        assert_eq!(
+            given(r#"{"type":"frame","t":3,"expressions":{}}"#),
+            (TrackingData::Bones { points: vec![], head: None }, Some([0.0; 3]))
+        );
+        let (_, expressions) = given(r#"{"type":"frame","t":4,"bones":{},"head":{"rotation":[0,0,0,1]}}"#);
+        assert_eq!(expressions, None, "what a frame does not say is not what the one before said");
+        assert_eq!(given(r#"{"type":"frame","t":5,"expressions":{"joy":1},"face":false}"#), (TrackingData::NoFace, None));
+
+        let before = frame.clone();
+        for (text, code, says) in [
+            (
+                r#"{"type":"frame","t":6,"expressions":{"suprise":1}}"#,
+                "unknown_expression",
+                "field expressions.suprise is no expression of this character, expected joy, surprise",
+            ),
+            (r#"{"type":"frame","t":6,"expressions":{"joy":1.21}}"#, "out_of_range", "field expressions.joy is 1.21, expected 0 to 1.2"),
+            (r#"{"type":"frame","t":6,"expressions":{"joy":-0.1}}"#, "out_of_range", "field expressions.joy is -0.1"),
+            (r#"{"type":"frame","t":6,"expressions":{"joy":null}}"#, "wrong_type", "field expressions"),
+            (r#"{"type":"frame","t":6,"expressions":[1]}"#, "wrong_type", "field expressions: invalid type: sequence"),
+            (r#"{"type":"frame","t":6,"expressions":{"joy":NaN}}"#, "malformed_json", "in field expressions"),
+        ] {
+            let error = reader.read(text, &mut frame).expect_err(text);
+            assert_eq!(error.code, code, "{text}: {error}");
+            assert!(error.message.contains(says), "{text}: {error}");
+            assert_eq!(frame, before, "{text}");
+        }
+    }
+
+    #[test]
+    fn expressions_for_a_character_without_any() {
+        let (mut reader, mut frame) = after_hello();
+        reader.read(r#"{"type":"frame","t":1,"landmarks":[[1,2],[3,4]],"expressions":{"joy":1}}"#, &mut frame).unwrap();
+        assert_eq!(frame.expressions, None);
+        let error = reader.read(r#"{"type":"frame","t":2,"expressions":{"joy":1}}"#, &mut frame).unwrap_err();
+        assert_eq!(error.code, "no_expressions");
+        // A sender does not know the character at the other end.
+        let mut reader = PublishReader::for_any_character();
+        reader.read(HELLO, &mut frame).unwrap();
+        reader.read(r#"{"type":"frame","t":1,"expressions":{"awe":1}}"#, &mut frame).unwrap();
     }
 
     #[test]
