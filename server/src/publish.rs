@@ -110,12 +110,9 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infa
 /// The session's pipeline, and whether it starts from the `kept` neutral face.
 fn start(hub: &Hub, hello: &PublishHello, kept: Option<Calibration>) -> Result<(Pipeline, bool), SolveError> {
     let (character, config) = (&hub.character, &hub.config.solve);
-    if let Some(kept) = kept {
-        match Pipeline::with_calibration(character.clone(), config, hello, 0, kept) {
-            // One of weights, of a sender that has a layout too: its landmarks have no neutral yet.
-            Err(SolveError::BadCalibration { .. }) => {}
-            other => return Ok((other?, true)),
-        }
+    // A neutral of weights does not fit a sender that has a layout too: its landmarks have none yet.
+    if let Some(pipeline) = kept.and_then(|kept| Pipeline::with_calibration(character.clone(), config, hello, 0, kept).ok()) {
+        return Ok((pipeline, true));
     }
     Ok((Pipeline::new(character.clone(), config, hello, 0)?, false))
 }
