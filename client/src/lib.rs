@@ -3,12 +3,15 @@
 
 pub mod asset;
 pub mod film;
+#[cfg(feature = "embedded")]
+pub mod gallery;
 pub mod link;
 mod picture_size;
 pub mod playout;
 #[cfg(feature = "embedded")]
 pub mod render_cli;
 pub mod renderer;
+mod sheet;
 pub mod spectator;
 pub mod twin;
 pub mod view;

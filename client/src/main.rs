@@ -4,6 +4,8 @@ use anyhow::anyhow;
 use clap::{Parser, Subcommand};
 use rhytid_client::film::{self, FilmArgs};
 #[cfg(feature = "embedded")]
+use rhytid_client::gallery::{self, GalleryArgs};
+#[cfg(feature = "embedded")]
 use rhytid_client::render_cli::{self, RenderArgs, StillArgs};
 use rhytid_client::view::{self, ViewArgs};
 use std::io::IsTerminal;
@@ -34,6 +36,9 @@ enum Command {
     /// Draw one picture of a pose
     #[cfg(feature = "embedded")]
     Still(StillArgs),
+    /// Draw the figures of the papers again: sheets of pictures and a page that shows them all
+    #[cfg(feature = "embedded")]
+    Gallery(GalleryArgs),
 }
 
 fn main() -> ExitCode {
@@ -71,6 +76,8 @@ fn run(cli: Cli) -> anyhow::Result<()> {
         }
         #[cfg(feature = "embedded")]
         Command::Still(args) => render_cli::still(&args)?,
+        #[cfg(feature = "embedded")]
+        Command::Gallery(args) => println!("{}", gallery::run(&args)?.display()),
     }
     Ok(())
 }

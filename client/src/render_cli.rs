@@ -99,6 +99,9 @@ pub enum PictureError {
         /// The names there are.
         expected: String,
     },
+    /// The character has not what a picture shows.
+    #[error("the character has no {0}")]
+    Lacks(&'static str),
 }
 
 type Result<T> = std::result::Result<T, PictureError>;
@@ -363,7 +366,7 @@ pub fn posed_points(character: &Character, name: &str, amount: f32, side: StillS
         .collect())
 }
 
-fn load_character(path: Option<&Path>) -> Result<CharacterAsset> {
+pub(crate) fn load_character(path: Option<&Path>) -> Result<CharacterAsset> {
     let Some(path) = path else {
         return CharacterAsset::from_glb(DEFAULT_CHARACTER_GLB)
             .map_err(|source| PictureError::Character { path: "built-in character".into(), source });
@@ -414,7 +417,7 @@ fn parse_degrees(text: &str) -> std::result::Result<f32, String> {
 }
 
 /// Each pixel the mean of `factor` by `factor`, in linear light.
-fn averaged(picture: &RgbaImage, factor: u32) -> RgbaImage {
+pub(crate) fn averaged(picture: &RgbaImage, factor: u32) -> RgbaImage {
     let linear: Vec<f32> = (0..256)
         .map(|code| {
             let encoded = code as f32 / 255.0;

@@ -112,7 +112,7 @@ fn is_watched(url: &str) -> bool {
 }
 
 /// Where Cargo puts what it builds.
-fn target_dir(root: &Path) -> PathBuf {
+pub fn target_dir(root: &Path) -> PathBuf {
     std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root.join("target"), PathBuf::from)
 }
 

@@ -1,8 +1,9 @@
-//! Developer commands: `cargo xtask demo | test | setup | bake | convert`.
+//! Developer commands: `cargo xtask demo | test | setup | bake | convert | gallery`.
 
 mod bake;
 mod convert;
 mod demo;
+mod gallery;
 mod setup;
 
 use anyhow::{Context, Result, ensure};
@@ -33,6 +34,12 @@ enum Task {
     Bake,
     /// Turn a normal map into partial derivatives or differences and back, and say what that lost
     Convert(convert::Conversion),
+    /// Draw the figures of the papers again, into target/gallery
+    Gallery {
+        /// Passed on to `rhytid-client gallery`
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
 }
 
 fn main() -> ExitCode {
@@ -42,6 +49,7 @@ fn main() -> ExitCode {
         Task::Setup => setup::run(),
         Task::Bake => bake::run(),
         Task::Convert(conversion) => convert::run(&conversion),
+        Task::Gallery { arguments } => gallery::run(&arguments),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
