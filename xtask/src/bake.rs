@@ -84,6 +84,7 @@ fn bake(source: &mut source::Source) -> Result<Vec<u8>> {
         poses,
         correctives: Vec::new(),
         zones: None,
+        colour: None,
         evaluation: schema::Evaluation::default(),
     };
     let bytes = glb::write(glb::Contents { parts: &parts, rig, face, painted: &painted, copyright: COPYRIGHT });
