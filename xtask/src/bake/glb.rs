@@ -1,11 +1,11 @@
 //! Writes the `.glb`: one mesh, one skin, sparse morph targets, textures inside.
 
-use super::bust::{Encoded, Painted};
+use super::bust::{BloodMaps, Encoded, Painted};
 use super::part::{Material, Part};
 use super::rig::Rig;
 use glam::Vec3;
 use rhytid_shared::ARKIT_NAMES;
-use rhytid_shared::character::schema::{EXTENSION, Face};
+use rhytid_shared::character::schema::{self, EXTENSION, Face};
 use serde_json::{Value, json};
 
 const FLOAT: u32 = 5126;
@@ -122,8 +122,10 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
     let materials = materials(&mut writer, painted);
     for (pose, map) in face.poses.iter_mut().zip(&painted.wrinkles) {
         let texture = writer.texture(&map.image, &format!("wrinkles_{}", pose.name));
-        pose.map = Some(rhytid_shared::character::schema::WrinkleMap { texture, scale: map.scale, contains_neutral: false });
+        pose.map = Some(schema::WrinkleMap { texture, scale: map.scale, contains_neutral: false });
     }
+
+    face.colour = Some(colour(&mut writer, &painted.blood));
 
     // Joints come first, so that joint and node indices are the same; the mesh's node is the last.
     let mut nodes: Vec<Value> = rig
@@ -167,6 +169,18 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
         "buffers": [{ "byteLength": writer.blob.len().next_multiple_of(4) }],
     });
     container(document.to_string().into_bytes(), writer.blob)
+}
+
+/// The maps of blood and what says how to read them.
+fn colour(writer: &mut Writer, blood: &BloodMaps) -> schema::Colour {
+    let base = writer.texture(&blood.base, "blood");
+    let changes = blood.changes.iter().map(|map| schema::ColourChange {
+        pose: map.pose.to_owned(),
+        texture: writer.texture(&map.image, &format!("blood_{}", map.pose)),
+        spread: map.spread,
+        shift: map.shift,
+    });
+    schema::Colour { base, most: blood.most, changes: changes.collect(), strength: 1.0 }
 }
 
 fn primitive(writer: &mut Writer, part: &Part) -> Value {
