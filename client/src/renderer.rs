@@ -408,6 +408,7 @@ impl Renderer {
             gazes: gazes(character, frame),
             skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
             blood: [self.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],
+            picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, 0.0, 0.0, 0.0],
             shown: [shown_term(settings.view), 0, 0, 0],
             shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
         }
@@ -454,6 +455,8 @@ impl Renderer {
             occlusion_query_set: None,
             multiview_mask: None,
         });
+        let stand_off = pipelines::STRAND_STAND_OFF;
+        pass.set_blend_constant(wgpu::Color { r: stand_off, g: stand_off, b: stand_off, a: stand_off });
         pass.set_pipeline(&self.background);
         pass.draw(0..3, 0..1);
         self.num_draws += 1;

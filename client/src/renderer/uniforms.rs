@@ -51,6 +51,8 @@ pub struct Frame {
     pub skin: [f32; 4],
     /// x: largest change of haemoglobin the codes of the map of blood reach, optical density.
     pub blood: [f32; 4],
+    /// x: metres a pixel covers at a metre.
+    pub picture: [f32; 4],
     /// 1 for each pose the influence view shows.
     pub shown_poses: [[f32; 4]; MAX_POSE_VECTORS],
     /// x: 1 shows only what shines through, 2 only the blood.
@@ -71,6 +73,7 @@ assert_layout!(Frame, frame, {
     gazes: GAZES,
     skin: SKIN,
     blood: BLOOD,
+    picture: PICTURE,
     shown_poses: SHOWN_POSES,
     shown: SHOWN,
 });

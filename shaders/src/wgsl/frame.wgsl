@@ -37,6 +37,8 @@ struct Frame {
     skin: vec4<f32>,
     // x: largest change of haemoglobin the codes of the map of blood reach, optical density; 0 where the colour stays.
     blood: vec4<f32>,
+    // x: metres a pixel covers at a metre.
+    picture: vec4<f32>,
     // Influence view: 1 for each pose shown.
     shown_poses: array<vec4<f32>, 2>,
     // x: see the constants.
