@@ -231,6 +231,7 @@ fn materials(writer: &mut Writer, painted: &Painted) -> Vec<Value> {
                 }),
                 Material::Tongue => plain(name, [0.46, 0.16, 0.15, 1.0], 0.4),
                 Material::Brow => two_sided(plain(name, [0.080, 0.054, 0.038, 1.0], 0.65)),
+                Material::Tear => plain(name, [1.0, 1.0, 1.0, 1.0], 0.08),
                 Material::Lash => two_sided(plain(name, [0.020, 0.015, 0.012, 1.0], 0.5)),
             }
         })
