@@ -31,6 +31,7 @@ pub(super) struct GpuWindow {
     /// Set by wgpu when the device is gone: a driver that was updated or crashed, a GPU that was unplugged.
     is_lost: Arc<AtomicBool>,
     adapter_name: String,
+    is_software: bool,
     device: wgpu::Device,
     queue: wgpu::Queue,
     renderer: Renderer,
@@ -115,6 +116,7 @@ impl GpuWindow {
             has_area: size.width > 0 && size.height > 0,
             is_suboptimal: false,
             is_lost,
+            is_software: info.device_type == wgpu::DeviceType::Cpu,
             adapter_name: info.name,
             device,
             queue,
@@ -267,7 +269,9 @@ impl GpuWindow {
         }
         let most = self.device.limits().max_texture_dimension_2d;
         let pixels = |points: f32| ((points * output.pixels_per_point).round() as u32).clamp(1, most);
-        let face_size = [pixels(face_rect.width()), pixels(face_rect.height())];
+        // A processor that draws has the time for a quarter of the pixels.
+        let share = if self.is_software { 0.5 } else { 1.0 };
+        let face_size = [pixels(face_rect.width() * share), pixels(face_rect.height() * share)];
         if self.face.size != face_size {
             self.face = FaceTexture::new(&self.device, &mut self.painter, face_size, Some(self.face.id));
         }

@@ -94,8 +94,13 @@ pub fn lift(rotation: &DMat3, translation: DVec3, ray: DVec2, z: f64) -> DVec3 {
 
 /// As [`lift`], with the shift in x and y for each metre of depth.
 pub(super) fn lift_with_slope(rotation: &DMat3, translation: DVec3, ray: DVec2, z: f64) -> (DVec3, DVec2) {
-    let direction = rotation.transpose() * DVec3::new(ray.x, ray.y, 1.0);
-    (lift(rotation, translation, ray, z), DVec2::new(direction.x, direction.y) / direction.z.min(-LEAST_FACING))
+    (lift(rotation, translation, ray, z), slope(&rotation.transpose(), ray))
+}
+
+/// The shift in x and y of head space along a ray for each metre of depth.
+pub(super) fn slope(head_from_camera: &DMat3, ray: DVec2) -> DVec2 {
+    let direction = *head_from_camera * DVec3::new(ray.x, ray.y, 1.0);
+    DVec2::new(direction.x, direction.y) / direction.z.min(-LEAST_FACING)
 }
 
 /// True unless the weighted points lie (nearly) on one line, so that a pose can be found from them.

@@ -280,7 +280,8 @@ impl LandmarkSession {
         let rays = &self.observation.rays;
         self.placing.clear();
         self.placing.extend(self.points.stable.iter().filter(|(i, _)| self.observation.is_sure[*i]));
-        if !head_pose::spans(&self.model, &self.placing, self.unit) {
+        // All of them do, or the layout would have no perspective.
+        if self.placing.len() < self.points.stable.len() && !head_pose::spans(&self.model, &self.placing, self.unit) {
             self.placing.clear();
             self.placing.extend_from_slice(&self.points.stable);
         }
@@ -336,7 +337,7 @@ impl LandmarkSession {
         }
         if let Some(pose) = &self.pose {
             let Observation { rays, is_sure } = &self.observation;
-            self.lower_face.settle(&self.model, pose, rays, is_sure, &mut self.settled);
+            self.lower_face.settle(pose, rays, is_sure, &mut self.settled);
         }
     }
 

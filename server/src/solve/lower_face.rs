@@ -43,18 +43,17 @@ impl LowerFace {
         for (at, &i) in self.points.iter().enumerate() {
             let ray = head_pose::project(&matrix, pose.translation, model[i]);
             self.neutral[at] = model[i].truncate();
-            self.neutral_slopes[at] = head_pose::lift_with_slope(&matrix, pose.translation, ray, model[i].z).1;
+            self.neutral_slopes[at] = head_pose::slope(&matrix.transpose(), ray);
         }
     }
 
-    /// Takes the shared slide out of `settled`, which holds the points as lifted onto the depths of `model`. Points that are not
-    /// sure neither tell of it nor are changed.
-    pub(super) fn settle(&mut self, model: &[DVec3], pose: &Pose, rays: &[DVec2], is_sure: &[bool], settled: &mut [DVec2]) {
-        let matrix = pose.matrix();
+    /// Takes the shared slide out of `settled`, which holds the points as lifted. Points that are not sure neither tell of it nor
+    /// are changed.
+    pub(super) fn settle(&mut self, pose: &Pose, rays: &[DVec2], is_sure: &[bool], settled: &mut [DVec2]) {
+        let head_from_camera = pose.matrix().transpose();
         let (mut moved, mut slope, mut num) = (DVec2::ZERO, DVec2::ZERO, 0.0);
         for (at, &i) in self.points.iter().enumerate().filter(|(_, i)| is_sure[**i]) {
-            let now = head_pose::lift_with_slope(&matrix, pose.translation, rays[i], model[i].z).1;
-            self.slopes[at] = now - self.neutral_slopes[at];
+            self.slopes[at] = head_pose::slope(&head_from_camera, rays[i]) - self.neutral_slopes[at];
             moved += settled[i] - self.neutral[at];
             slope += self.slopes[at];
             num += 1.0;

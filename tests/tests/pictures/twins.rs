@@ -332,6 +332,11 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
                     (2, Resource::Block(bytemuck::bytes_of(&table))),
                     (3, Resource::Texture { view: &layers_view, dimension: D2Array, is_filterable: true }),
                     (4, Resource::Sampler),
+                    // Zones are left out, but the shader names what they read.
+                    (7, Resource::Texture { view: &layers_view, dimension: D2Array, is_filterable: true }),
+                    (8, Resource::Texture { view: &layers_view, dimension: D2Array, is_filterable: true }),
+                    (9, Resource::Texture { view: &base_view, dimension: D2, is_filterable: true }),
+                    (10, Resource::Block(&[0; size_of::<uniforms::ZoneWeights>()])),
                 ],
             ),
             (
