@@ -1,11 +1,13 @@
 //! A character as the renderer needs it, decoded from its `.glb` on the CPU: triangles with skinning and weight
 //! gradients, joints, materials, wrinkle maps. No GPU here.
 
+mod blood;
 mod gradients;
 mod joints;
 mod load;
 mod mips;
 
+pub use blood::{BloodChange, BloodMaps, BloodTexel};
 pub use gradients::{triangle_gradient, weight_gradients};
 pub use joints::{JointMotion, Palette};
 pub use mips::{MipChain, Texels};
@@ -42,6 +44,8 @@ pub struct CharacterAsset {
     pub wrinkles: Option<WrinkleMaps>,
     /// Maps of the wrinkle zones, where the character has them.
     pub zones: Option<ZoneMaps>,
+    /// Colour that follows the face, where the character's does.
+    pub blood: Option<BloodMaps>,
 }
 
 impl CharacterAsset {

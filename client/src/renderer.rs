@@ -2,6 +2,7 @@
 
 mod anatomy;
 mod background;
+mod blood;
 mod camera;
 mod coefficients;
 mod environment;
@@ -36,6 +37,7 @@ pub use view::{BlendError, BlendMode, NameError, Term, ViewError, ViewMode, Wrin
 
 use crate::asset::{CharacterAsset, Palette, Surface};
 use anatomy::{Mouth, eyeballs, gazes};
+use blood::Blood;
 use glam::{Affine3A, Vec3};
 use layouts::Layouts;
 use pipelines::{Key, Look, Pipelines, Wire};
@@ -89,11 +91,13 @@ pub struct SkinSettings {
     pub gloss: f32,
     /// Multiplies the roughness of the map.
     pub roughness: f32,
+    /// How strongly its colour follows the face; 0 leaves it as it is at rest.
+    pub blood: f32,
 }
 
 impl Default for SkinSettings {
     fn default() -> Self {
-        Self { scattering: 1.0, translucency: 1.0, gloss: 1.0, roughness: 1.0 }
+        Self { scattering: 1.0, translucency: 1.0, gloss: 1.0, roughness: 1.0, blood: 1.0 }
     }
 }
 
@@ -126,6 +130,7 @@ pub struct Renderer {
     primitives: Vec<Primitive>,
     group: CharacterGroup,
     zone_scales: Option<ZoneScales>,
+    blood: Option<Blood>,
     pipelines: Pipelines,
     background: wgpu::RenderPipeline,
     shadow: Shadow,
@@ -198,6 +203,7 @@ impl Renderer {
             bounds: Bounds::new(asset),
             group,
             zone_scales: asset.zones.as_ref().map(ZoneScales::new),
+            blood: asset.blood.as_ref().map(|maps| Blood::new(&asset.character, maps)),
             pipelines: Pipelines::new(&layouts, asset.character.num_poses()),
             background: background::pipeline(device),
             static_bytes: uploader.bytes + shadow.bytes,
@@ -311,6 +317,11 @@ impl Renderer {
             self.is_stretched = weights.stretched != [[0.0; 4]; 2];
             queue.write_buffer(&self.group.zone_weights, 0, bytemuck::bytes_of(&weights));
         }
+        if let Some(blood) = &mut self.blood
+            && blood.mix(frame)
+        {
+            upload::write_blood(queue, &self.group.blood, blood.codes());
+        }
         queue.write_buffer(&self.group.coefficients, 0, bytemuck::cast_slice(&coefficients));
         queue.write_buffer(&self.frame_block, 0, bytemuck::bytes_of(&self.frame_uniforms(size, settings, frame)));
 
@@ -400,7 +411,9 @@ impl Renderer {
             eyeballs: eyeballs(character),
             gazes: gazes(character, frame),
             skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
-            shown: [u32::from(settings.view == ViewMode::Term(Term::Translucency)), 0, 0, 0],
+            blood: [self.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],
+            picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, 0.0, 0.0, 0.0],
+            shown: [shown_term(settings.view), 0, 0, 0],
             shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
         }
     }
@@ -446,6 +459,8 @@ impl Renderer {
             occlusion_query_set: None,
             multiview_mask: None,
         });
+        let stand_off = pipelines::STRAND_STAND_OFF;
+        pass.set_blend_constant(wgpu::Color { r: stand_off, g: stand_off, b: stand_off, a: stand_off });
         pass.set_pipeline(&self.background);
         pass.draw(0..3, 0..1);
         self.num_draws += 1;
@@ -525,6 +540,15 @@ impl Renderer {
             pass.draw_indexed(0..primitive.num_edge_indices, 0, 0..1);
             self.num_draws += 2;
         }
+    }
+}
+
+/// `shown` in `frame.wgsl`.
+fn shown_term(view: ViewMode) -> u32 {
+    match view {
+        ViewMode::Term(Term::Translucency) => 1,
+        ViewMode::Term(Term::Blood) => 2,
+        _ => 0,
     }
 }
 

@@ -1,6 +1,7 @@
 //! CPU twins of what the GPU computes: skinning with turning normals, vertex influences, slopes of maps, each wrinkle
 //! blend, the tone curve. The tests hold these to published and derived numbers, and the GPU to these.
 
+pub mod blood;
 pub mod skin;
 pub mod zones;
 

@@ -4,6 +4,7 @@
 //! value. Both the server and the viewers load through [`Character::from_glb`], so a file one of them takes the other takes too.
 
 mod checked;
+mod colour;
 mod glb;
 pub mod schema;
 mod zones;
@@ -11,4 +12,5 @@ mod zones;
 pub use checked::{
     Bone, Character, CharacterError, Corrective, Drive, GroupDegenerate, LandmarkWeight, LidKind, Mode, Pose, ShapeDeltas, Side, WrinkleMap,
 };
+pub use colour::{Colour, ColourChange};
 pub use zones::{BridgeRow, Expression, Zone, ZoneMap, Zones};

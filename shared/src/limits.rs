@@ -15,6 +15,9 @@ pub const MAX_EXPRESSIONS: usize = 16;
 pub const MAX_MASK_SIDE: u32 = 256;
 /// Largest side of the zones' wrinkle maps, texels; the paper's have 256.
 pub const MAX_ZONE_MAP_SIDE: u32 = 1024;
+/// Largest side of the maps of blood, texels: they are smooth (those of Jimenez and others 2010 have 64), and all of them are
+/// mixed on the processor where the face changes.
+pub const MAX_COLOUR_SIDE: u32 = 128;
 /// Most feature points in a user's own layout; more than any tracker in use gives (MediaPipe: 478).
 pub const MAX_FEATURE_POINTS: usize = 512;
 /// Most vertices of a character: WebGL2 draws of this size still hold 60 Hz on a phone.

@@ -49,6 +49,7 @@ pub(crate) fn tiny_character() -> Character {
         shapes: Vec::new(),
         correctives: Vec::new(),
         zones: None,
+        colour: None,
         mode: Mode::Independent,
         group_degenerate: GroupDegenerate::Exclude,
         falloff: 1.0,

@@ -27,6 +27,7 @@ mod source;
 mod strands;
 mod subdivide;
 mod surface;
+mod tears;
 mod teeth;
 mod uv;
 mod weights;
@@ -72,6 +73,7 @@ fn bake(source: &mut source::Source) -> Result<Vec<u8>> {
         teeth::tongue(&base, rig.joint_of("jaw")),
         brows::build(&front, &skin.weights),
         lashes::build(&skin, eyes),
+        tears::build(&skin, eyes),
     ];
     for part in &parts {
         ensure!(part.positions.len() <= usize::from(u16::MAX), "{} has {} vertices", part.material.name(), part.positions.len());
@@ -88,6 +90,7 @@ fn bake(source: &mut source::Source) -> Result<Vec<u8>> {
         poses,
         correctives: Vec::new(),
         zones: None,
+        colour: None,
         evaluation: schema::Evaluation::default(),
     };
     let bytes = glb::write(glb::Contents { parts: &parts, rig, face, painted: &painted, copyright: COPYRIGHT });

@@ -1,5 +1,6 @@
 //! Decodes a checked `.glb`.
 
+use super::blood;
 use super::gradients::weight_gradients;
 use super::joints::{JointMotion, Palette};
 use super::mips::{MipChain, Texels};
@@ -40,7 +41,8 @@ pub(super) fn load(bytes: &[u8]) -> Result<CharacterAsset> {
     }
     let wrinkles = read_wrinkles(&character, &mut images)?;
     let zones = read_zones(&character, &mut images)?;
-    Ok(CharacterAsset { character: Arc::new(character), primitives, palette, wrinkles, zones })
+    let blood = blood::read(&character, |texture| images.of_texture(texture).map(|image| image.cloned()))?;
+    Ok(CharacterAsset { character: Arc::new(character), primitives, palette, wrinkles, zones, blood })
 }
 
 /// Names from a joint up to the root.

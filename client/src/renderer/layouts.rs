@@ -52,6 +52,7 @@ impl Layouts {
                 binding(8, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
                 binding(9, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),
                 uniform(10, Stages::FRAGMENT, size_of::<uniforms::ZoneWeights>()),
+                binding(11, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),
             ],
         );
         let map = |at| binding(at, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2));

@@ -131,6 +131,7 @@ impl Pipelines {
         self.surfaces.entry(key).or_insert_with(|| {
             let (pass, vertex_entry, fragment_entry, blend) = match key.look {
                 Look::Wrinkled(blend) => (Pass::Surface(key.shader), "vs_wrinkled", "fs_wrinkled", blend),
+                Look::Bare if key.is_strand() => (Pass::Surface(key.shader), "vs_strand", "fs_strand", 0),
                 Look::Bare => (Pass::Surface(key.shader), "vs_bare", "fs_bare", 0),
                 Look::Influence => (Pass::Influence, "vs_wrinkled", "fs_influence", 0),
                 Look::Normals(blend) => (Pass::Normals, "vs_wrinkled", "fs_wrinkled", blend),
@@ -153,7 +154,11 @@ impl Pipelines {
                     constants: &constants,
                     topology: wgpu::PrimitiveTopology::TriangleList,
                     cull_mode: (!key.is_double_sided).then_some(wgpu::Face::Back),
-                    is_film: key.shader == ShaderKind::Wet,
+                    mixing: match key.shader {
+                        ShaderKind::Wet => Mixing::Film,
+                        ShaderKind::Hair if key.is_strand() => Mixing::Strand,
+                        _ => Mixing::None,
+                    },
                     alpha_to_coverage: key.has_coverage,
                 },
             )
@@ -178,7 +183,7 @@ impl Pipelines {
                     constants: &[],
                     topology,
                     cull_mode: None,
-                    is_film: false,
+                    mixing: Mixing::None,
                     alpha_to_coverage: false,
                 },
             )
@@ -196,6 +201,11 @@ fn module<'a>(modules: &'a mut BTreeMap<Pass, wgpu::ShaderModule>, device: &wgpu
 }
 
 impl Key {
+    /// Hair of its own geometry, seen from both sides, rather than of a picture's alpha or a solid.
+    fn is_strand(self) -> bool {
+        self.look == Look::Bare && self.shader == ShaderKind::Hair && self.is_double_sided && !self.has_coverage
+    }
+
     /// What no pose can wrinkle, and all that is not skin, is drawn bare when the face is drawn with wrinkles.
     pub fn new(look: Look, surface: Surface, is_double_sided: bool, alpha: Alpha, poses: u8, (zones, has_stretch): (u8, bool)) -> Self {
         let shader = ShaderKind::from(surface);
@@ -218,6 +228,39 @@ impl Key {
     }
 }
 
+/// What becomes of what lies under a surface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Mixing {
+    /// It is covered.
+    None,
+    /// It stays, highlights are added to its own.
+    Film,
+    /// It is covered by the share that alpha says; strands in any order, they are alike. Its own alphas (depth, scattering) stay but for that share of
+    /// [`STRAND_STAND_OFF`]: scattering neither blurs the strand nor takes its darkness into the skin.
+    Strand,
+}
+
+/// Metres strands seem to stand off the skin.
+pub const STRAND_STAND_OFF: f64 = 0.05;
+
+impl Mixing {
+    fn blend(self) -> Option<wgpu::BlendState> {
+        use wgpu::{BlendComponent, BlendFactor, BlendOperation};
+        let of = |src_factor, dst_factor, operation| BlendComponent { src_factor, dst_factor, operation };
+        match self {
+            Self::None => None,
+            Self::Film => {
+                let sum = of(BlendFactor::One, BlendFactor::One, BlendOperation::Add);
+                Some(wgpu::BlendState { color: sum, alpha: sum })
+            }
+            Self::Strand => Some(wgpu::BlendState {
+                color: of(BlendFactor::SrcAlpha, BlendFactor::OneMinusSrcAlpha, BlendOperation::Add),
+                alpha: of(BlendFactor::Constant, BlendFactor::One, BlendOperation::ReverseSubtract),
+            }),
+        }
+    }
+}
+
 struct SceneParts<'a> {
     label: &'a str,
     layout: &'a wgpu::PipelineLayout,
@@ -227,18 +270,13 @@ struct SceneParts<'a> {
     constants: &'a [(&'a str, f64)],
     topology: wgpu::PrimitiveTopology,
     cull_mode: Option<wgpu::Face>,
-    /// Adds its highlights to those of what lies under it.
-    is_film: bool,
+    mixing: Mixing,
     alpha_to_coverage: bool,
 }
 
 fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::RenderPipeline {
     let options = wgpu::PipelineCompilationOptions { constants: parts.constants, ..Default::default() };
-    let sum = wgpu::BlendComponent {
-        src_factor: wgpu::BlendFactor::One,
-        dst_factor: wgpu::BlendFactor::One,
-        operation: wgpu::BlendOperation::Add,
-    };
+    let is_film = parts.mixing == Mixing::Film;
     device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
         label: Some(parts.label),
         layout: Some(parts.layout),
@@ -251,7 +289,7 @@ fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::Render
         primitive: wgpu::PrimitiveState { topology: parts.topology, cull_mode: parts.cull_mode, ..Default::default() },
         depth_stencil: Some(wgpu::DepthStencilState {
             format: DEPTH_FORMAT,
-            depth_write_enabled: Some(!parts.is_film),
+            depth_write_enabled: Some(parts.mixing == Mixing::None),
             depth_compare: Some(wgpu::CompareFunction::LessEqual),
             stencil: wgpu::StencilState::default(),
             bias: wgpu::DepthBiasState::default(),
@@ -264,13 +302,13 @@ fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::Render
             targets: &[
                 Some(wgpu::ColorTargetState {
                     format: SCENE_FORMAT,
-                    blend: parts.is_film.then_some(wgpu::BlendState { color: sum, alpha: sum }),
-                    write_mask: if parts.is_film { wgpu::ColorWrites::COLOR } else { wgpu::ColorWrites::ALL },
+                    blend: parts.mixing.blend(),
+                    write_mask: if is_film { wgpu::ColorWrites::COLOR } else { wgpu::ColorWrites::ALL },
                 }),
                 Some(wgpu::ColorTargetState {
                     format: SCENE_FORMAT,
-                    blend: None,
-                    write_mask: if parts.is_film { wgpu::ColorWrites::empty() } else { wgpu::ColorWrites::ALL },
+                    blend: if is_film { None } else { parts.mixing.blend() },
+                    write_mask: if is_film { wgpu::ColorWrites::empty() } else { wgpu::ColorWrites::ALL },
                 }),
             ],
         }),

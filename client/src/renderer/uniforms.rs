@@ -49,9 +49,13 @@ pub struct Frame {
     pub gazes: [[f32; 4]; 2],
     /// How fast light dies in flesh (1/mm), highlights, roughness, how much light leaks through: all multipliers.
     pub skin: [f32; 4],
+    /// x: largest change of haemoglobin the codes of the map of blood reach, optical density.
+    pub blood: [f32; 4],
+    /// x: metres a pixel covers at a metre.
+    pub picture: [f32; 4],
     /// 1 for each pose the influence view shows.
     pub shown_poses: [[f32; 4]; MAX_POSE_VECTORS],
-    /// x: 1 shows only what shines through.
+    /// x: 1 shows only what shines through, 2 only the blood.
     pub shown: [u32; 4],
 }
 assert_layout!(Frame, frame, {
@@ -68,6 +72,8 @@ assert_layout!(Frame, frame, {
     eyeballs: EYEBALLS,
     gazes: GAZES,
     skin: SKIN,
+    blood: BLOOD,
+    picture: PICTURE,
     shown_poses: SHOWN_POSES,
     shown: SHOWN,
 });

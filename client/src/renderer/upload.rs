@@ -1,5 +1,6 @@
 //! Puts a decoded character on the device and counts the bytes.
 
+use super::blood;
 use super::coefficients::pose_table;
 use super::layouts::Layouts;
 use super::regions::{self, Region};
@@ -44,6 +45,8 @@ pub struct CharacterGroup {
     pub palette: wgpu::Buffer,
     pub coefficients: wgpu::Buffer,
     pub zone_weights: wgpu::Buffer,
+    /// Change of haemoglobin.
+    pub blood: wgpu::Texture,
     /// Bytes of the zones' masks and of their wrinkle map.
     pub zone_bytes: u64,
     pub group: wgpu::BindGroup,
@@ -178,6 +181,7 @@ impl Uploader<'_> {
         };
         let zone_bytes = self.bytes - before;
         let difference = self.texture("zone differences", &[difference.unwrap_or(&no_difference)]);
+        let blood = self.blood(asset.blood.as_ref().map_or(1, |maps| maps.side));
         let array = |texture: &wgpu::Texture| {
             texture.create_view(&wgpu::TextureViewDescriptor { dimension: Some(wgpu::TextureViewDimension::D2Array), ..Default::default() })
         };
@@ -196,9 +200,27 @@ impl Uploader<'_> {
                 entry(8, wgpu::BindingResource::TextureView(&zone_maps)),
                 entry(9, wgpu::BindingResource::TextureView(&difference)),
                 entry(10, zone_weights.as_entire_binding()),
+                entry(11, wgpu::BindingResource::TextureView(&blood.create_view(&wgpu::TextureViewDescriptor::default()))),
             ],
         });
-        CharacterGroup { palette, coefficients, zone_weights, zone_bytes, group }
+        CharacterGroup { palette, coefficients, zone_weights, blood, zone_bytes, group }
+    }
+
+    /// The map of blood, `side` texels a side, as it is at rest.
+    fn blood(&mut self, side: u32) -> wgpu::Texture {
+        let texture = self.device.create_texture(&wgpu::TextureDescriptor {
+            label: Some("change of blood"),
+            size: wgpu::Extent3d { width: side, height: side, depth_or_array_layers: 1 },
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format: blood::FORMAT,
+            usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+            view_formats: &[],
+        });
+        self.bytes += u64::from(side) * u64::from(side);
+        write_blood(self.queue, &texture, &vec![blood::UNCHANGED; (side * side) as usize]);
+        texture
     }
 
     /// One part with its material.
@@ -268,6 +290,12 @@ impl Uploader<'_> {
             ..Default::default()
         })
     }
+}
+
+/// Fills the map of blood.
+pub fn write_blood(queue: &wgpu::Queue, texture: &wgpu::Texture, codes: &[u8]) {
+    let layout = wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(texture.width()), rows_per_image: None };
+    queue.write_texture(texture.as_image_copy(), codes, layout, texture.size());
 }
 
 /// Shorthand for one entry of a bind group.

@@ -33,11 +33,13 @@ pub enum Term {
     Scattering,
     /// What the key light sends through thin flesh.
     Translucency,
+    /// Where blood comes (red) and goes (cyan) as the face moves, over a grey face.
+    Blood,
 }
 
 impl Term {
     /// Every term.
-    pub const ALL: [Self; 4] = [Self::Diffuse, Self::Specular, Self::Scattering, Self::Translucency];
+    pub const ALL: [Self; 5] = [Self::Diffuse, Self::Specular, Self::Scattering, Self::Translucency, Self::Blood];
 
     /// Its name on command lines.
     pub fn name(self) -> &'static str {
@@ -46,6 +48,7 @@ impl Term {
             Self::Specular => "specular",
             Self::Scattering => "scattering",
             Self::Translucency => "translucency",
+            Self::Blood => "blood",
         }
     }
 }
@@ -99,7 +102,7 @@ impl ViewMode {
 
     /// True for views of light rather than of numbers: they are scattered and toned.
     pub fn is_lit(self) -> bool {
-        !matches!(self, Self::Influence(_) | Self::Normals | Self::Wireframe)
+        !matches!(self, Self::Influence(_) | Self::Normals | Self::Wireframe | Self::Term(Term::Blood))
     }
 }
 

@@ -61,6 +61,7 @@ pub(super) fn skin(ui: &mut Ui, switches: &mut Switches) {
     slider(ui, "Shines through", &mut skin.translucency, 0.0..=3.0);
     slider(ui, "Gloss", &mut skin.gloss, 0.0..=3.0);
     slider(ui, "Roughness", &mut skin.roughness, 0.5..=1.6);
+    slider(ui, "Blood", &mut skin.blood, 0.0..=3.0);
     if ui.button("Reset").clicked() {
         *skin = SkinSettings::default();
     }
@@ -71,6 +72,7 @@ pub(super) fn skin(ui: &mut Ui, switches: &mut Switches) {
         (ViewMode::Term(Term::Specular), "Highlights"),
         (ViewMode::Term(Term::Scattering), "Scattered"),
         (ViewMode::Term(Term::Translucency), "Through"),
+        (ViewMode::Term(Term::Blood), "Blood"),
     ];
     for terms in terms.chunks(3) {
         row(ui, terms, |view| view == switches.draw.view).into_iter().for_each(|view| switches.show(view));

@@ -164,6 +164,7 @@ pub fn character() -> Arc<Character> {
         shapes,
         correctives: Vec::new(),
         zones: None,
+        colour: None,
         mode: Mode::Independent,
         group_degenerate: GroupDegenerate::Exclude,
         falloff: 1.0,

@@ -21,12 +21,17 @@ fn nearest_eye(head: vec3<f32>) -> u32 {
     return select(1u, 0u, distance(head, frame.eyeballs[0].xyz) < distance(head, frame.eyeballs[1].xyz));
 }
 
-// The lids shade the ball along their edge: it is darkest under the upper one.
+// The lids shade the ball along their edge: it is darkest under the upper one, and in the corners.
 fn lid_light(offset: vec3<f32>) -> f32 {
-    let upper = smoothstep(0.10, 0.55, offset.y);
+    let upper = smoothstep(-0.02, 0.52, offset.y);
     let lower = smoothstep(-0.22, -0.60, offset.y);
-    let corner = smoothstep(0.45, 0.95, abs(offset.x));
-    return (1.0 - 0.62 * upper) * (1.0 - 0.35 * lower) * (1.0 - 0.40 * corner);
+    let corner = smoothstep(0.38, 0.90, abs(offset.x));
+    return (1.0 - 0.70 * upper) * (1.0 - 0.35 * lower) * (1.0 - 0.50 * corner);
+}
+
+// Light that the lids let through has come off skin: it is the warmer the less of it there is.
+fn lid_colour(occlusion: f32) -> vec3<f32> {
+    return pow(vec3<f32>(occlusion), vec3<f32>(0.82, 1.06, 1.22));
 }
 
 // Where the iris that is seen through the cornea at `in` lies in the map: the ray is refracted and cut with the plane of
@@ -70,6 +75,7 @@ fn fs_bare(in: Varyings) -> Shaded {
     );
     let uv = uv_behind_cornea(in, normal, view, gaze, centre, ball.w);
     let occlusion = lid_light(offset);
+    let shade = lid_colour(occlusion);
     let visible = key_visibility(in.world, normal);
     let albedo = albedo_of(uv).rgb;
 
@@ -78,11 +84,11 @@ fn fs_bare(in: Varyings) -> Shaded {
     let is_iris = 1.0 - smoothstep(0.88 * IRIS_RADIUS, 1.02 * IRIS_RADIUS, length(from_axis) / ball.w);
     let matt = normalize(mix(normal, gaze - from_axis / ball.w * 0.9, is_iris));
 
-    var light_in = ambient_irradiance(normal) * occlusion;
+    var light_in = ambient_irradiance(normal) * shade;
     var film = vec3<f32>(0.0);
     for (var i = 0u; i < 4u; i += 1u) {
         let light = frame.lights[i].direction.xyz;
-        let arriving = frame.lights[i].radiance.rgb * occlusion * select(1.0, visible, i == 0u);
+        let arriving = frame.lights[i].radiance.rgb * shade * select(1.0, visible, i == 0u);
         // The white lets light through, so it turns dark late.
         light_in += arriving * max((dot(matt, light) + 0.2) / 1.44, 0.0);
         if i > 1u {

@@ -35,6 +35,10 @@ struct Frame {
     // x: 1/mm, how fast light dies in the flesh (see transmittance). y: strength of highlights. z: roughness, multiplied.
     // w: how much light leaks through.
     skin: vec4<f32>,
+    // x: largest change of haemoglobin the codes of the map of blood reach, optical density; 0 where the colour stays.
+    blood: vec4<f32>,
+    // x: metres a pixel covers at a metre.
+    picture: vec4<f32>,
     // Influence view: 1 for each pose shown.
     shown_poses: array<vec4<f32>, 2>,
     // x: see the constants.
@@ -43,6 +47,8 @@ struct Frame {
 
 // Only what shines through flesh is shown.
 const SHOW_TRANSLUCENCY: u32 = 1u;
+// Where blood comes and goes, over a grey face: display values.
+const SHOW_BLOOD: u32 = 2u;
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 
@@ -61,7 +67,16 @@ fn shaded(world: vec3<f32>, diffuse: vec3<f32>, specular: vec3<f32>, scattering:
     if frame.shown.x == SHOW_TRANSLUCENCY {
         return Shaded(vec4<f32>(0.0, 0.0, 0.0, 1.0), vec4<f32>(0.0, 0.0, 0.0, depth_of(world)));
     }
+    if frame.shown.x == SHOW_BLOOD {
+        return display(grey_of(diffuse));
+    }
     return Shaded(vec4<f32>(specular, 1.0 + scattering), vec4<f32>(diffuse, depth_of(world)));
+}
+
+// A grey to lay false colours over, display value.
+fn grey_of(light: vec3<f32>) -> vec3<f32> {
+    let luma = dot(max(light, vec3<f32>(0.0)), vec3<f32>(0.2126, 0.7152, 0.0722));
+    return vec3<f32>(0.72 * sqrt(luma / (0.35 + luma)));
 }
 
 // Display values: they pass through all that follows as they are.

@@ -8,8 +8,24 @@ const F0: f32 = 0.028;
 const OILY_SHARE: f32 = 0.45;
 const OILY_ROUGHNESS: f32 = 0.62;
 
+// Optical density a unit of haemoglobin adds to red, green and blue (Tsumura and others 1999).
+const HAEMOGLOBIN: vec3<f32> = vec3<f32>(0.2988, 0.6838, 0.6657);
+// The view of blood is fully red or cyan at this change, optical density.
+const BLOOD_SHOWN: f32 = 0.25;
+
+// Haemoglobin more than at rest, optical density.
+fn blood_change(uv: vec2<f32>) -> f32 {
+    return (textureSample(blood_map, wrinkle_sampler, uv).r * (255.0 / 127.0) - 128.0 / 127.0) * frame.blood.x;
+}
+
+// Linear RGB of skin that holds `change` more haemoglobin (Jimenez and others 2010, without their table).
+fn with_blood(albedo: vec3<f32>, change: f32) -> vec3<f32> {
+    return albedo * exp(-change * HAEMOGLOBIN);
+}
+
 fn shade(in: Varyings, normal: vec3<f32>) -> Shaded {
-    let albedo = albedo_of(in.uv).rgb;
+    let blood = blood_change(in.uv);
+    let albedo = with_blood(albedo_of(in.uv).rgb, blood);
     let finish = finish_of(in.uv);
     let smooth_normal = normalize(in.normal);
     let view = normalize(frame.eye.xyz - in.world);
@@ -45,6 +61,11 @@ fn shade(in: Varyings, normal: vec3<f32>) -> Shaded {
     let horizon = clamp(1.0 + 1.3 * dot(reflected, smooth_normal), 0.0, 1.0);
     specular += room_reflection(reflected, roughness) * ambient_fresnel(F0, roughness, n_dot_v) * occlusion * occlusion * horizon * horizon;
     let diffuse = albedo * (light_in + through);
+    if frame.shown.x == SHOW_BLOOD {
+        let grey = grey_of(diffuse);
+        let hue = select(vec3<f32>(0.0, 0.75, 0.85), vec3<f32>(0.95, 0.10, 0.05), blood > 0.0);
+        return display(mix(grey, hue * (0.4 + grey), clamp(abs(blood) / BLOOD_SHOWN, 0.0, 1.0)));
+    }
     return shaded(in.world, min(diffuse, vec3<f32>(BRIGHTEST)), min(specular * frame.skin.y, vec3<f32>(BRIGHTEST)), in_mouth);
 }
 

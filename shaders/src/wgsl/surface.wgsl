@@ -35,6 +35,9 @@ struct ZoneWeights {
 @group(1) @binding(9) var zone_difference: texture_2d<f32>;
 @group(1) @binding(10) var<uniform> zone_weights: ZoneWeights;
 
+// Change of haemoglobin since rest: code 128 is none, the others reach frame.blood.x.
+@group(1) @binding(11) var blood_map: texture_2d<f32>;
+
 @group(2) @binding(0) var<uniform> material: Material;
 @group(2) @binding(1) var albedo_map: texture_2d<f32>;
 @group(2) @binding(2) var normal_map: texture_2d<f32>;

@@ -1,5 +1,6 @@
 //! A character after its checks.
 
+use super::colour::{self, Colour};
 use super::schema::{self, Face};
 use super::zones::{self, Zones};
 use crate::layout::NUM_IBUG;
@@ -61,6 +62,8 @@ pub struct Character {
     pub correctives: Vec<Corrective>,
     /// Wrinkle zones, where the character has them.
     pub zones: Option<Zones>,
+    /// How the skin's colour follows the face, where it does.
+    pub colour: Option<Colour>,
     /// How several poses on one bone share its displacement.
     pub mode: Mode,
     /// What a group member does that a pose does not move.
@@ -248,6 +251,7 @@ impl Character {
         let poses = check_poses(&face.poses, &bones, &index_of)?;
         let correctives = check_correctives(&face.correctives, &index_of)?;
         let zones = face.zones.as_ref().map(|given| zones::check(given, &poses, &index_of)).transpose()?;
+        let colour = face.colour.as_ref().map(|given| colour::check(given, &poses)).transpose()?;
         let falloff = face.evaluation.falloff;
         if !(falloff > 0.0 && falloff <= 1.0) {
             return Err(CharacterError::field(
@@ -268,6 +272,7 @@ impl Character {
             shapes: Vec::new(),
             correctives,
             zones,
+            colour,
             mode: face.evaluation.mode,
             group_degenerate: face.evaluation.group_degenerate,
             falloff,

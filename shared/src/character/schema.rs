@@ -1,6 +1,10 @@
 //! The root extension `RHYTID_face` of a character's `.glb`, as JSON. Positions are metres in head space: the glTF
 //! scene's own frame (right-handed, +Y up, +Z out of the face, +X to the character's left) with the head at neutral.
 
+mod colour;
+
+pub use colour::{Colour, ColourChange};
+
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -37,6 +41,9 @@ pub struct Face {
     /// Wrinkle zones ([J11]).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zones: Option<Zones>,
+    /// How the skin's colour follows the face.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub colour: Option<Colour>,
     /// How influences are computed.
     #[serde(default)]
     pub evaluation: Evaluation,

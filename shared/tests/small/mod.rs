@@ -94,6 +94,19 @@ impl Glb {
         self
     }
 
+    /// Blood of 8 x 8 texels that `up` changes.
+    #[allow(dead_code, reason = "not every test binary looks at colour")]
+    pub fn with_colour(mut self) -> Self {
+        let [base, change] = [[60, 60, 128], [128, 200, 255]].map(|[r, g, b]| {
+            let picture = png_of(image::RgbaImage::from_pixel(8, 8, image::Rgba([r, g, b, 255])));
+            self.texture(&picture)
+        });
+        self.json["extensions"]["RHYTID_face"]["colour"] = json!({
+            "base": base, "most": 2.0, "changes": [{"pose": "up", "texture": change, "spread": 0.5, "shift": 0.3}],
+        });
+        self
+    }
+
     /// Adds an image; gives the index of its texture.
     #[allow(dead_code, reason = "not every test binary adds images")]
     pub fn texture(&mut self, png: &[u8]) -> usize {

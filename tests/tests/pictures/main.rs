@@ -3,6 +3,7 @@
 //! `RHYTID_UPDATE_GOLDENS=1 cargo test -p rhytid-tests --test pictures` draws the goldens anew. A machine without a
 //! software adapter shows these tests as ignored.
 
+mod blood;
 mod golden;
 mod probe;
 mod properties;
@@ -66,6 +67,7 @@ fn main() -> ExitCode {
     };
     twins::add(&mut add);
     skin::add(&mut add);
+    blood::add(&mut add);
     zones::add(&mut add);
     properties::add(&mut add);
     golden::add(&mut add);

@@ -60,7 +60,7 @@ fn srgb_from_linear(linear: f32) -> f32 {
 }
 
 /// A value a point: `CASE` is the expression of `in.a` and `in.b`.
-fn function_probe(stage: &Stage, call: &str, cases: &[[[f32; 4]; 2]]) -> anyhow::Result<Vec<[f32; 4]>> {
+pub fn function_probe(stage: &Stage, call: &str, cases: &[[[f32; 4]; 2]]) -> anyhow::Result<Vec<[f32; 4]>> {
     let source = format!(
         "{}{PLACE}
         struct Case {{ @location(0) a: vec4<f32>, @location(1) b: vec4<f32> }}

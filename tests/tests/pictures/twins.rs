@@ -189,6 +189,7 @@ fn influences(stage: &Stage) -> anyhow::Result<()> {
             palette: stage.asset.palette.clone(),
             wrinkles: None,
             zones: None,
+            blood: None,
         };
         let halves = (0..num_poses.div_ceil(4) as u32)
             .map(|half| probe_skinning(stage, &asset, &frame, &vertices, 3 + half))

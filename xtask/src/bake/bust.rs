@@ -80,6 +80,29 @@ pub struct SlopeMap {
     pub scale: f32,
 }
 
+/// What a pose does to the blood under the skin, in codes about 128: red how much more uneven it becomes, green how much more
+/// there is.
+pub struct BloodMap {
+    /// Name of the pose in the file.
+    pub pose: &'static str,
+    /// The picture.
+    pub image: Encoded,
+    /// What the codes of red reach: ratio less 1.
+    pub spread: f32,
+    /// What the codes of green reach, optical density.
+    pub shift: f32,
+}
+
+/// Blood under the skin.
+pub struct BloodMaps {
+    /// At rest: amount and its mean all round as shares of `most`, and how much a place belongs to the left half.
+    pub base: Encoded,
+    /// Optical density.
+    pub most: f32,
+    /// One for each of [`Bust::poses`].
+    pub changes: Vec<BloodMap>,
+}
+
 /// Masks and maps of the wrinkle zones.
 pub struct PaintedZones {
     /// RGBA, linear: four zones each.
@@ -109,4 +132,6 @@ pub struct Painted {
     pub eye_albedo: Encoded,
     /// Teeth and gums, sRGB: upper half of the picture (v < 0.5) enamel, v from root to edge; lower half gum.
     pub teeth_albedo: Encoded,
+    /// Blood, of the skin's mesh.
+    pub blood: BloodMaps,
 }

@@ -1,12 +1,12 @@
 //! Writes the `.glb`: one mesh, one skin, sparse morph targets, textures inside.
 
-use super::bust::{Encoded, Painted};
+use super::bust::{BloodMaps, Encoded, Painted};
 use super::part::{Material, Part};
 use super::rig::Rig;
 use super::zones;
 use glam::Vec3;
 use rhytid_shared::ARKIT_NAMES;
-use rhytid_shared::character::schema::{EXTENSION, Face, ZoneMap};
+use rhytid_shared::character::schema::{self, EXTENSION, Face, ZoneMap};
 use serde_json::{Value, json};
 
 const FLOAT: u32 = 5126;
@@ -123,7 +123,7 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
     let materials = materials(&mut writer, painted);
     for (pose, map) in face.poses.iter_mut().zip(&painted.wrinkles) {
         let texture = writer.texture(&map.image, &format!("wrinkles_{}", pose.name));
-        pose.map = Some(rhytid_shared::character::schema::WrinkleMap { texture, scale: map.scale, contains_neutral: false });
+        pose.map = Some(schema::WrinkleMap { texture, scale: map.scale, contains_neutral: false });
     }
     let [first, second] = &painted.zones.masks;
     let masks = [writer.texture(first, "zone_mask_0"), writer.texture(second, "zone_mask_1")];
@@ -131,6 +131,8 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
         .map(|(map, name)| ZoneMap { texture: writer.texture(&map.image, name), scale: map.scale });
     let difference = writer.texture(&painted.zones.difference, "zone_difference");
     face.zones = Some(zones::describe(masks, map, stretch, difference));
+
+    face.colour = Some(colour(&mut writer, &painted.blood));
 
     // Joints come first, so that joint and node indices are the same; the mesh's node is the last.
     let mut nodes: Vec<Value> = rig
@@ -174,6 +176,18 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
         "buffers": [{ "byteLength": writer.blob.len().next_multiple_of(4) }],
     });
     container(document.to_string().into_bytes(), writer.blob)
+}
+
+/// The maps of blood and what says how to read them.
+fn colour(writer: &mut Writer, blood: &BloodMaps) -> schema::Colour {
+    let base = writer.texture(&blood.base, "blood");
+    let changes = blood.changes.iter().map(|map| schema::ColourChange {
+        pose: map.pose.to_owned(),
+        texture: writer.texture(&map.image, &format!("blood_{}", map.pose)),
+        spread: map.spread,
+        shift: map.shift,
+    });
+    schema::Colour { base, most: blood.most, changes: changes.collect(), strength: 1.0 }
 }
 
 fn primitive(writer: &mut Writer, part: &Part) -> Value {
@@ -224,6 +238,7 @@ fn materials(writer: &mut Writer, painted: &Painted) -> Vec<Value> {
                 }),
                 Material::Tongue => plain(name, [0.46, 0.16, 0.15, 1.0], 0.4),
                 Material::Brow => two_sided(plain(name, [0.080, 0.054, 0.038, 1.0], 0.65)),
+                Material::Tear => plain(name, [1.0, 1.0, 1.0, 1.0], 0.08),
                 Material::Lash => two_sided(plain(name, [0.020, 0.015, 0.012, 1.0], 0.5)),
             }
         })

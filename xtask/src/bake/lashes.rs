@@ -84,7 +84,7 @@ pub fn build(skin: &Skin, eyes: [Eyeball; 2]) -> Part {
 
 /// The edge of a lid's outer surface in the half plane at `azimuth`: the last point, going from the lid's middle towards
 /// the opening, where a ray from the eye's centre still meets skin close to the ball.
-fn margin(surface: &Surface<'_>, eye: Eyeball, azimuth: f32, is_upper: bool) -> Option<Hit> {
+pub fn margin(surface: &Surface<'_>, eye: Eyeball, azimuth: f32, is_upper: bool) -> Option<Hit> {
     let side = if is_upper { 1.0 } else { -1.0 };
     let on_lid = |elevation: f32| {
         let (sin, cos) = libm::sincosf(elevation);

@@ -3,6 +3,7 @@
 //! the same bytes.
 
 mod atlas;
+mod blood;
 mod chart;
 mod encode;
 mod eyes;
@@ -52,5 +53,6 @@ pub fn paint(bust: &Bust) -> Result<Painted> {
         zones,
         eye_albedo: eyes::paint(bust)?,
         teeth_albedo: teeth::paint()?,
+        blood: blood::paint(bust, &features)?,
     })
 }

@@ -17,11 +17,13 @@ pub enum Material {
     Brow,
     /// Eyelashes.
     Lash,
+    /// Line of tears along the lower lids.
+    Tear,
 }
 
 impl Material {
     /// All of them.
-    pub const ALL: [Self; 6] = [Self::Skin, Self::Eye, Self::Teeth, Self::Tongue, Self::Brow, Self::Lash];
+    pub const ALL: [Self; 7] = [Self::Skin, Self::Eye, Self::Teeth, Self::Tongue, Self::Brow, Self::Lash, Self::Tear];
 
     /// Name in the file, by which viewers tell them apart.
     pub fn name(self) -> &'static str {
@@ -32,6 +34,7 @@ impl Material {
             Self::Tongue => "tongue",
             Self::Brow => "brow",
             Self::Lash => "lash",
+            Self::Tear => "tear",
         }
     }
 }

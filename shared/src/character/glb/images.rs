@@ -1,6 +1,8 @@
 //! Checks images: kind, size and what all of them together will take by their headers alone; the small masks of wrinkle zones by
 //! their texels.
 
+mod colour;
+
 use super::super::checked::{Character, CharacterError};
 use super::super::zones::Zones;
 use super::Result;
@@ -22,6 +24,9 @@ pub(super) fn check_images(document: &gltf::Document, blob: &[u8], character: &C
     if let Some(zones) = &character.zones {
         check_zone_maps(&textures, &size_of, zones)?;
         check_masks(document, &textures, &size_of, blob, zones)?;
+    }
+    if let Some(given) = &character.colour {
+        colour::check(document, &textures, &size_of, blob, given)?;
     }
     check_total(document, &textures, &size_of, character)
 }
@@ -170,8 +175,9 @@ fn check_total(document: &gltf::Document, textures: &[usize], size_of: &[Size], 
         let others = [Some(zones.map.texture), zones.stretch.map(|map| map.texture), zones.difference];
         zones.masks.iter().copied().chain(others.into_iter().flatten())
     });
+    let of_colour = character.colour.iter().flat_map(colour::textures);
     let mut total = 0_u64;
-    for texture in of_parts.chain(of_poses).chain(of_zones) {
+    for texture in of_parts.chain(of_poses).chain(of_zones).chain(of_colour) {
         let (width, height) = size_of[textures[texture]];
         total += u64::from(width) * u64::from(height);
         if total > MAX_TEXELS {

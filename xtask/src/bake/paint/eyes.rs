@@ -43,8 +43,8 @@ fn iris_color(p: Vec2, angle: f32, radius: f32) -> Vec3 {
     let fibre = |count: f32, along: f32, seed: u32| noise(Vec3::new(cos * count, sin * count, radius * along + wave), seed);
     let fibres = 0.55 * fibre(9.0, 1.6, 403) + 0.35 * fibre(20.0, 2.2, 404) + 0.25 * fibre(38.0, 3.0, 405);
     let collarette = 0.56 + 0.05 * fibre(7.0, 0.0, 406) + 0.02 * fibre(17.0, 0.0, 407);
-    let outer = srgb(84, 88, 76).lerp(srgb(102, 100, 82), 0.5 + 0.5 * fractal(Vec3::new(p.x, p.y, 2.0) * 2.3, 2, 408));
-    let inner = srgb(122, 84, 46);
+    let outer = srgb(84, 87, 78).lerp(srgb(100, 98, 85), 0.5 + 0.5 * fractal(Vec3::new(p.x, p.y, 2.0) * 2.3, 2, 408));
+    let inner = srgb(112, 86, 60);
     let mut color = inner.lerp(outer, smoothstep(collarette - 0.07, collarette + 0.16, radius + 0.10 * fibres));
     color *= 0.62 * (1.0 + 0.70 * fibres);
     color *= 1.0 + 0.35 * bell(radius - collarette, 0.05);
@@ -61,9 +61,9 @@ fn iris_color(p: Vec2, angle: f32, radius: f32) -> Vec3 {
 
 fn sclera(p: Vec2, angle: f32, radius: f32) -> Vec3 {
     let away = p.length();
-    let mut color = srgb(219, 210, 202).lerp(srgb(209, 199, 191), 0.5 + 0.5 * fractal(Vec3::new(p.x, p.y, 4.0) * 3.0, 3, 411));
+    let mut color = srgb(198, 186, 174).lerp(srgb(186, 171, 158), 0.5 + 0.5 * fractal(Vec3::new(p.x, p.y, 4.0) * 3.0, 3, 411));
     // Pinker towards the corners, where the lids' lining begins.
-    let corner = smoothstep(0.38, 0.80, p.x.abs() + 0.3 * p.y.abs());
+    let corner = smoothstep(0.24, 0.66, p.x.abs() + 0.3 * p.y.abs());
     color = color.lerp(srgb(206, 142, 130), 0.62 * corner);
     color = color.lerp(srgb(196, 128, 118), 0.7 * smoothstep(0.66, 0.95, away));
     // Thin vessels that wind in from the corners and thin out before the limbus.

@@ -82,6 +82,11 @@ fn color(features: &Features, texel: &Texel, marks: &Marks, moles: &[(Vec3, f32,
     color.lerp(rgb([188, 110, 100]), marks.socket)
 }
 
+/// Haemoglobin beyond the base, optical density along its direction.
+pub fn blood(features: &Features, p: Vec3, marks: &Marks) -> f32 {
+    pigment(features, p, marks, &[]).blood
+}
+
 fn pigment(features: &Features, p: Vec3, marks: &Marks, moles: &[(Vec3, f32, f32)]) -> Pigment {
     let blotch = fractal(p / 19.0, 3, 1);
     if marks.hair > 0.98 {
