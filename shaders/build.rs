@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const PASSES: [&str; 13] =
     ["background", "eye", "hair", "influence", "normals", "plain", "present", "scatter", "shadow", "skin", "tone", "wet", "wireframe"];
 /// Parts that are exported by themselves, too: tests build passes of their own from them.
-const PARTS: [&str; 2] = ["skinning", "wrinkles"];
+const PARTS: [&str; 3] = ["skinning", "surface", "wrinkles"];
 /// `//!include NAME` on a line of its own puts `NAME.wgsl` there, once.
 const INCLUDE: &str = "//!include ";
 /// The smallest uniform block every WebGL2 device takes, bytes.

@@ -27,16 +27,6 @@ pub enum AssetError {
         /// What the decoder said.
         source: image::ImageError,
     },
-    /// A primitive is not made of triangles.
-    #[error("character file meshes[{mesh}].primitives[{primitive}] is made of {mode:?}, expected triangles")]
-    NotTriangles {
-        /// Mesh index.
-        mesh: usize,
-        /// Primitive index within the mesh.
-        primitive: usize,
-        /// What it is made of.
-        mode: gltf::mesh::Mode,
-    },
 }
 
 /// A character ready to be uploaded.
@@ -97,14 +87,21 @@ pub enum Surface {
 }
 
 impl Surface {
-    /// The surface a material's name stands for: the first of these words it contains, case ignored; skin where none.
+    /// The surface a material's name stands for: the first of these words among its own, singular or plural, in any case; skin
+    /// where none. Words end where letters end or a small letter meets a capital.
     pub fn from_material_name(name: &str) -> Self {
-        const WORDS: [(&str, Surface); 16] = [
+        const WORDS: [(&str, Surface); 28] = [
             ("brow", Surface::Hair),
+            ("eyebrow", Surface::Hair),
             ("lash", Surface::Hair),
+            ("lashes", Surface::Hair),
+            ("eyelash", Surface::Hair),
+            ("eyelashes", Surface::Hair),
             ("hair", Surface::Hair),
             ("cornea", Surface::Wet),
             ("tear", Surface::Wet),
+            ("tearline", Surface::Wet),
+            ("lacrimal", Surface::Wet),
             ("wet", Surface::Wet),
             ("teeth", Surface::Mouth),
             ("tooth", Surface::Mouth),
@@ -112,14 +109,37 @@ impl Surface {
             ("tongue", Surface::Mouth),
             ("mouth", Surface::Mouth),
             ("cloth", Surface::Cloth),
+            ("clothes", Surface::Cloth),
             ("shirt", Surface::Cloth),
             ("collar", Surface::Cloth),
-            ("eye", Surface::Eye),
             ("skin", Surface::Skin),
+            ("lid", Surface::Skin),
+            ("eyelid", Surface::Skin),
+            ("eye", Surface::Eye),
+            ("eyeball", Surface::Eye),
+            ("sclera", Surface::Eye),
+            ("iris", Surface::Eye),
         ];
-        let name = name.to_lowercase();
-        WORDS.iter().find(|(word, _)| name.contains(word)).map_or(Self::Skin, |&(_, surface)| surface)
+        let words = words(name);
+        let is_named = |word: &str| words.iter().any(|own| own == word || own.strip_suffix('s') == Some(word));
+        WORDS.iter().find(|(word, _)| is_named(word)).map_or(Self::Skin, |&(_, surface)| surface)
     }
+}
+
+/// The words of a name in small letters: `EyeLash_L.001` has eye, lash and l.
+fn words(name: &str) -> Vec<String> {
+    let mut words = vec![String::new()];
+    let mut was_small = false;
+    for letter in name.chars() {
+        if !letter.is_alphabetic() || (was_small && letter.is_uppercase()) {
+            words.push(String::new());
+        }
+        if letter.is_alphabetic() {
+            words.last_mut().expect("there is one from the start").extend(letter.to_lowercase());
+        }
+        was_small = letter.is_lowercase();
+    }
+    words
 }
 
 /// A vertex as it is uploaded. Head space at rest, metres.
@@ -184,4 +204,32 @@ pub struct WrinkleMaps {
     pub scales: Vec<f32>,
     /// Whether a layer also contains the pores of the neutral map.
     pub contains_neutral: Vec<bool>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn surface_is_read_from_whole_words_of_the_materials_name() {
+        for (name, surface) in [
+            ("skin", Surface::Skin),
+            ("eyelid_skin", Surface::Skin),
+            ("Eyelids", Surface::Skin),
+            ("EyeLid.001", Surface::Skin),
+            ("Gumball machine", Surface::Skin),
+            ("", Surface::Skin),
+            ("eye", Surface::Eye),
+            ("M_EyeLeft", Surface::Eye),
+            ("Eyes.L", Surface::Eye),
+            ("EyeLash_R", Surface::Hair),
+            ("eyebrows", Surface::Hair),
+            ("cornea", Surface::Wet),
+            ("M_GumsTongue", Surface::Mouth),
+            ("TEETH", Surface::Mouth),
+            ("shirt_collar", Surface::Cloth),
+        ] {
+            assert_eq!(Surface::from_material_name(name), surface, "{name}");
+        }
+    }
 }

@@ -172,7 +172,7 @@ impl Crew {
     fn update(&mut self, spectator: &mut Spectator) -> Result<bool, FilmError> {
         let mut replaced: Option<Result<(), RenderError>> = None;
         spectator.update(|glb| {
-            let asset = CharacterAsset::from_glb(glb).map_err(|error| error.to_string())?;
+            let asset = CharacterAsset::from_glb(&glb).map_err(|error| error.to_string())?;
             let character = Arc::clone(&asset.character);
             replaced = Some(Headless::new(&asset).map(|headless| (self.headless, self.character) = (headless, Arc::clone(&character))));
             Ok(character)

@@ -142,10 +142,14 @@ impl Drop for Link {
 }
 
 fn run(mut options: LinkOptions, inbox: &Inbox, wake: &dyn Fn()) {
-    let mut backoff = Backoff::new();
+    let (mut backoff, mut fetch_backoff) = (Backoff::of_connections(), Backoff::of_fetches());
     while !inbox.is_stopped() {
         let started_at = Instant::now();
+        let connects = inbox.stats().connects;
         let ended = connection::watch(&mut options, inbox, wake);
+        if inbox.stats().connects > connects {
+            fetch_backoff = Backoff::of_fetches();
+        }
         let state = match ended {
             Ended::Stopped => return,
             Ended::Refused(message) => {
@@ -156,6 +160,12 @@ fn run(mut options: LinkOptions, inbox: &Inbox, wake: &dyn Fn()) {
                 let pause = backoff.next_pause(started_at.elapsed());
                 tracing::debug!(server = %options.server, why, ?pause, "connection lost");
                 LinkState::Lost { why, retry_at: Instant::now() + pause, attempts: backoff.failures() }
+            }
+            Ended::NoCharacter(why) => {
+                // However long the transfer took, it was no good connection.
+                let pause = fetch_backoff.next_pause(Duration::ZERO);
+                tracing::warn!(server = %options.server, why, ?pause, "no character");
+                LinkState::Lost { why, retry_at: Instant::now() + pause, attempts: fetch_backoff.failures() }
             }
         };
         let retry_at = match &state {

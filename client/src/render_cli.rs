@@ -95,7 +95,7 @@ pub struct PictureArgs {
     #[arg(long, default_value = "0,0", value_parser = parse_pair, allow_hyphen_values = true)]
     pub orbit: [f32; 2],
     /// Distance of the camera, 1 frames the head
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 1.0, value_parser = parse_zoom)]
     pub zoom: f32,
 }
 
@@ -126,7 +126,7 @@ pub struct StillArgs {
     #[arg(long)]
     pub pose: Option<String>,
     /// How much of the pose, 0 to 1
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 1.0, value_parser = parse_amount)]
     pub amount: f32,
     /// Which bones take it: the character's own left or right, or both
     #[arg(long, value_enum, default_value_t = StillSide::Both)]
@@ -302,15 +302,25 @@ fn progress_bar(num_frames: u64) -> ProgressBar {
 fn parse_weights(given: &[String]) -> Result<[f32; NUM_ARKIT_SHAPES]> {
     let mut weights = [0.0; NUM_ARKIT_SHAPES];
     for text in given {
-        let parsed = text.split_once('=').and_then(|(name, value)| Some((ArkitShape::from_name(name)?, value.parse().ok()?)));
+        let parsed = text.split_once('=').and_then(|(name, value)| Some((ArkitShape::from_name(name)?, parse_amount(value).ok()?)));
         let (shape, value) = parsed.ok_or_else(|| PictureError::Name {
             what: "weight",
             got: text.clone(),
-            expected: format!("NAME=VALUE with a name of {}", rhytid_shared::ARKIT_NAMES.join(", ")),
+            expected: format!("NAME=VALUE with 0 to 1 and a name of {}", rhytid_shared::ARKIT_NAMES.join(", ")),
         })?;
         weights[shape.index()] = value;
     }
     Ok(weights)
+}
+
+fn parse_zoom(text: &str) -> std::result::Result<f32, String> {
+    let zoom = text.trim().parse().ok().filter(|zoom| (0.05..=20.0).contains(zoom));
+    zoom.ok_or_else(|| format!("{text:?} is no distance, expected 0.05 to 20, where 1 frames the head"))
+}
+
+fn parse_amount(text: &str) -> std::result::Result<f32, String> {
+    let amount = text.trim().parse().ok().filter(|amount| (0.0..=1.0).contains(amount));
+    amount.ok_or_else(|| format!("{text:?} is no amount, expected 0 to 1"))
 }
 
 fn parse_pair(text: &str) -> std::result::Result<[f32; 2], String> {
@@ -333,9 +343,20 @@ mod tests {
     }
 
     #[test]
+    fn distances_and_amounts_are_numbers_within_reason() {
+        assert_eq!((parse_zoom("0.5"), parse_amount("1")), (Ok(0.5), Ok(1.0)));
+        for bad in ["nan", "inf", "0", "-1", "near"] {
+            assert!(parse_zoom(bad).is_err_and(|message| message.contains("expected 0.05 to 20")), "{bad}");
+        }
+        for bad in ["nan", "-0.1", "1.01", ""] {
+            assert!(parse_amount(bad).is_err_and(|message| message.contains("expected 0 to 1")), "{bad}");
+        }
+    }
+
+    #[test]
     fn unknown_weight_names_are_refused() {
         assert!(parse_weights(&["jawOpen=0.5".into()]).is_ok());
-        for bad in ["jawOpne=0.5", "jawOpen", "jawOpen=x"] {
+        for bad in ["jawOpne=0.5", "jawOpen", "jawOpen=x", "jawOpen=nan", "jawOpen=1.5"] {
             assert!(matches!(parse_weights(&[bad.into()]), Err(PictureError::Name { what: "weight", .. })), "{bad}");
         }
     }

@@ -84,12 +84,12 @@ impl Spectator {
     }
 
     /// Takes what has come. Where the server animates another character, `load` gets its `.glb` and makes it drawable.
-    pub fn update(&mut self, mut load: impl FnMut(&[u8]) -> Result<Arc<Character>, String>) {
+    pub fn update(&mut self, mut load: impl FnMut(Vec<u8>) -> Result<Arc<Character>, String>) {
         let news = self.link.take_news();
         if let Some(connected) = news.connected {
             self.playout.reconnected(self.time(Instant::now()));
             if let CharacterSource::Fetched(glb) = connected.character {
-                match load(&glb) {
+                match load(glb) {
                     Ok(character) => {
                         self.playout = Playout::new(&character);
                         self.character = character;
@@ -117,9 +117,10 @@ impl Spectator {
         match (self.link.state(), self.playout.state()) {
             (LinkState::Refused { message }, _) => status(StatusKind::Refused, "Refused", message),
             (LinkState::Connecting, _) => status(StatusKind::Connecting, "Connecting", format!("Looking for {server}")),
-            (LinkState::Lost { why, retry_at, .. }, _) => {
+            (LinkState::Lost { why, retry_at, attempts }, _) => {
                 let left = retry_at.saturating_duration_since(now).as_secs_f32().ceil();
-                let next = if left > 0.0 { format!("trying again in {left} s") } else { "trying again".into() };
+                let again = if attempts > 1 { format!("attempt {attempts} failed, trying again") } else { "trying again".into() };
+                let next = if left > 0.0 { format!("{again} in {left} s") } else { again };
                 status(StatusKind::ServerGone, "Server gone", format!("{server}: {why}; {next}"))
             }
             (LinkState::Live, _) if self.unusable.is_some() => {

@@ -14,12 +14,13 @@ use crate::asset::{AssetError, CharacterAsset};
 use crate::renderer::{RenderError, ViewError, ViewMode};
 use crate::spectator::{Spectator, StatusKind, WatchArgs};
 use panel::{Rates, Scene};
-use rhytid_shared::DEFAULT_CHARACTER_GLB;
+use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB};
+use std::borrow::Cow;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use switches::Switches;
-use window::{Drawn, GpuWindow};
+use window::{Canvas, GpuWindow};
 use winit::application::ApplicationHandler;
 use winit::dpi::LogicalSize;
 use winit::event::WindowEvent;
@@ -54,6 +55,9 @@ pub enum WindowError {
     /// The window cannot be drawn into.
     #[error("the window cannot be drawn into: {0}")]
     Surface(String),
+    /// The device went away again and again.
+    #[error("the GPU device was lost again within {} s", LEAST_DEVICE_LIFE.as_secs())]
+    DeviceLost,
     /// No adapter, no device, or a picture that does not come back.
     #[error(transparent)]
     Render(#[from] RenderError),
@@ -83,8 +87,13 @@ pub enum WindowError {
 const WINDOW_SIZE: [f64; 2] = [1120.0, 760.0];
 /// Smallest window that has room for the panel and a face, points.
 const LEAST_WINDOW_SIZE: [f64; 2] = [480.0, 320.0];
-/// Most pictures a second where the display does not set the pace itself.
-const MAX_FPS: u32 = 120;
+/// Most pictures a second where the display does not set the pace itself: some drivers, and displays that are none, do not
+/// wait for it.
+const MAX_FPS: f64 = 120.0;
+/// How much faster than the display the window may draw: the display sets the pace, this only bounds it where it does not.
+const FASTER_THAN_DISPLAY: f64 = 1.5;
+/// A device that is lost again sooner than this will be lost for ever.
+const LEAST_DEVICE_LIFE: Duration = Duration::from_secs(5);
 /// How often a window in which nothing moves is drawn, for the numbers and the seconds that count down.
 const AT_REST: Duration = Duration::from_millis(250);
 /// How long the face must have been live before it is photographed: longer than the blend from rest.
@@ -101,21 +110,26 @@ struct Wake;
 /// Until the server names another character the default one is drawn.
 pub fn run(args: ViewArgs) -> Result<(), WindowError> {
     let asset = CharacterAsset::from_glb(DEFAULT_CHARACTER_GLB)?;
-    let mut switches = Switches::new(&asset.character);
-    switches.show(ViewMode::parse(&args.view, &asset.character)?);
+    let character = Arc::clone(&asset.character);
+    let mut switches = Switches::new(&character);
+    switches.show(ViewMode::parse(&args.view, &character)?);
     let event_loop = EventLoop::<Wake>::with_user_event().build().map_err(|error| WindowError::NoDisplay(plain_words(&error)))?;
     let proxy = event_loop.create_proxy();
     // The event loop is gone only when the window is.
     let wake = move || drop(proxy.send_event(Wake));
     let mut app = App {
-        spectator: Spectator::open(args.watch, Arc::clone(&asset.character), wake),
+        spectator: Spectator::open(args.watch, Arc::clone(&character), wake),
         switches,
-        asset,
+        character,
+        glb: Cow::Borrowed(DEFAULT_CHARACTER_GLB),
+        asset: Some(asset),
         gpu: None,
+        device_since: Instant::now(),
         rates: Rates::default(),
         pictures: 0,
         next_at: Instant::now(),
-        is_hidden: false,
+        is_occluded: false,
+        is_surface_hidden: false,
         opened_at: Instant::now(),
         live_since: None,
         screenshot: args.screenshot,
@@ -138,15 +152,23 @@ struct App {
     spectator: Spectator,
     switches: Switches,
     /// The character drawn.
-    asset: CharacterAsset,
+    character: Arc<Character>,
+    /// Its file: a device that is lost takes the decoded character with it, which is ten times as large.
+    glb: Cow<'static, [u8]>,
+    /// The decoded character, until there is a device to upload it to.
+    asset: Option<CharacterAsset>,
     gpu: Option<GpuWindow>,
+    /// When the device was opened.
+    device_since: Instant,
     rates: Rates,
     /// Pictures shown.
     pictures: u64,
     /// When the next picture is due.
     next_at: Instant,
-    /// Nobody can see the window.
-    is_hidden: bool,
+    /// The system says that nobody can see the window.
+    is_occluded: bool,
+    /// The surface gave nothing to draw into, as nobody can see it.
+    is_surface_hidden: bool,
     opened_at: Instant,
     live_since: Option<Instant>,
     screenshot: Option<PathBuf>,
@@ -160,21 +182,61 @@ impl App {
             .with_inner_size(LogicalSize::new(WINDOW_SIZE[0], WINDOW_SIZE[1]))
             .with_min_inner_size(LogicalSize::new(LEAST_WINDOW_SIZE[0], LEAST_WINDOW_SIZE[1]));
         let window = event_loop.create_window(attributes).map_err(|error| WindowError::Window(error.to_string()))?;
-        self.gpu = Some(GpuWindow::new(event_loop, window, &self.asset)?);
+        self.open_device(event_loop, Arc::new(window))
+    }
+
+    fn open_device(&mut self, event_loop: &ActiveEventLoop, window: Arc<Window>) -> Result<(), WindowError> {
+        let asset = match self.asset.take() {
+            Some(asset) => asset,
+            None => CharacterAsset::from_glb(&self.glb)?,
+        };
+        self.gpu = Some(GpuWindow::new(event_loop, window, &asset)?);
+        self.device_since = Instant::now();
         Ok(())
     }
 
-    fn draw(&mut self) -> Result<(), WindowError> {
+    /// Everything on the device anew, in the same window.
+    fn reopen_device(&mut self, event_loop: &ActiveEventLoop) -> Result<(), WindowError> {
+        if self.device_since.elapsed() < LEAST_DEVICE_LIFE {
+            return Err(WindowError::DeviceLost);
+        }
+        match self.gpu.take() {
+            Some(gpu) => self.open_device(event_loop, gpu.into_window()),
+            None => Ok(()),
+        }
+    }
+
+    /// Nobody can see the window, whoever says so.
+    fn is_hidden(&self) -> bool {
+        self.is_occluded || self.is_surface_hidden
+    }
+
+    /// Shortest time between two pictures.
+    fn pace(&self) -> Duration {
+        let display = self.gpu.as_ref().and_then(|gpu| gpu.window().current_monitor()?.refresh_rate_millihertz());
+        let most = display.map_or(MAX_FPS, |millihertz| MAX_FPS.max(FASTER_THAN_DISPLAY * f64::from(millihertz) / 1e3));
+        Duration::from_secs_f64(1.0 / most)
+    }
+
+    fn draw(&mut self, event_loop: &ActiveEventLoop) -> Result<(), WindowError> {
+        let begun_at = Instant::now();
         let Some(gpu) = &mut self.gpu else { return Ok(()) };
-        let (asset, switches) = (&mut self.asset, &mut self.switches);
+        let canvas = gpu.acquire()?;
+        if let Canvas::DeviceLost = canvas {
+            self.next_at = begun_at;
+            return self.reopen_device(event_loop);
+        }
+        // After the wait for the canvas: what is shown shall be as new as can be.
+        let now = Instant::now();
+        let (character, switches, file) = (&mut self.character, &mut self.switches, &mut self.glb);
         self.spectator.update(|glb| {
-            let new = CharacterAsset::from_glb(glb).map_err(|error| error.to_string())?;
+            let new = CharacterAsset::from_glb(&glb).map_err(|error| error.to_string())?;
             gpu.change_character(&new);
             switches.change_character(&new.character);
-            *asset = new;
-            Ok(Arc::clone(&asset.character))
+            *file = Cow::Owned(glb);
+            *character = Arc::clone(&new.character);
+            Ok(new.character)
         });
-        let now = Instant::now();
         let frame = self.spectator.sample(now).clone();
         let status = self.spectator.status(now);
         let link = self.spectator.link_stats();
@@ -185,7 +247,7 @@ impl App {
 
         let adapter = gpu.adapter_name().to_owned();
         let scene = Scene {
-            character: &asset.character,
+            character,
             frame: &frame,
             status: &status,
             room: self.spectator.room().as_str(),
@@ -204,12 +266,17 @@ impl App {
         if self.screenshot.is_some() && now - self.opened_at > SCREENSHOT_PATIENCE {
             return Err(WindowError::NeverLive { status: format!("{}: {}", status.headline, status.detail) });
         }
-        let drawn = gpu.draw(&scene, switches)?;
-        self.is_hidden = drawn == Drawn::Hidden;
-        self.pictures += u64::from(drawn == Drawn::Shown);
-        let is_moving = self.spectator.is_moving() || gpu.is_panel_moving() || drawn == Drawn::Again;
-        let pause = if is_moving && !self.is_hidden { Duration::from_secs(1) / MAX_FPS } else { AT_REST };
-        self.next_at = now + pause;
+        self.is_surface_hidden = matches!(canvas, Canvas::Hidden);
+        let mut is_moving = self.spectator.is_moving();
+        if let Canvas::Ready(canvas) = canvas {
+            gpu.draw(canvas, &scene, switches);
+            self.pictures += 1;
+            is_moving |= gpu.is_panel_moving();
+        } else {
+            is_moving = true;
+        }
+        let pause = if is_moving && !self.is_hidden() { self.pace() } else { AT_REST };
+        self.next_at = begun_at + pause;
         Ok(())
     }
 
@@ -230,7 +297,7 @@ impl ApplicationHandler<Wake> for App {
 
     fn user_event(&mut self, _: &ActiveEventLoop, Wake: Wake) {
         // While the face moves it is drawn anyway; a window at rest wakes up.
-        if !self.is_hidden && !self.spectator.is_moving() {
+        if !self.is_hidden() && !self.spectator.is_moving() {
             self.next_at = Instant::now();
         }
     }
@@ -238,7 +305,7 @@ impl ApplicationHandler<Wake> for App {
     fn window_event(&mut self, event_loop: &ActiveEventLoop, _: WindowId, event: WindowEvent) {
         let Some(gpu) = &mut self.gpu else { return };
         if gpu.on_event(&event) {
-            self.next_at = self.next_at.min(Instant::now() + Duration::from_secs(1) / MAX_FPS);
+            self.next_at = self.next_at.min(Instant::now() + Duration::from_secs_f64(1.0 / MAX_FPS));
         }
         match event {
             WindowEvent::CloseRequested => event_loop.exit(),
@@ -246,12 +313,12 @@ impl ApplicationHandler<Wake> for App {
                 gpu.resize(size.width, size.height);
                 self.next_at = Instant::now();
             }
-            WindowEvent::Occluded(is_hidden) => {
-                self.is_hidden = is_hidden;
+            WindowEvent::Occluded(is_occluded) => {
+                self.is_occluded = is_occluded;
                 self.next_at = Instant::now();
             }
             WindowEvent::RedrawRequested => {
-                if let Err(error) = self.draw() {
+                if let Err(error) = self.draw(event_loop) {
                     self.fail(error, event_loop);
                 }
                 if self.switches.is_quitting {

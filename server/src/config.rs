@@ -18,12 +18,14 @@ pub enum ServerConfigError {
         source: std::io::Error,
     },
     /// The file is no TOML, or has a field that is none.
-    #[error("config {path}: {source}")]
+    #[error("config {path}, line {line}: {problem}")]
     Toml {
         /// The file as it was named.
         path: String,
-        /// What is wrong with it, with its line.
-        source: toml::de::Error,
+        /// Counted from 1.
+        line: usize,
+        /// What is wrong with it, in one line.
+        problem: String,
     },
     /// A value outside its range.
     #[error("config field {field} is {got}, expected {expected}")]
@@ -84,13 +86,16 @@ pub struct Limits {
     /// Bytes in one message of a publisher.
     #[arg(id = "max-message", long = "max-message", default_value_t = Self::default().message_bytes, value_name = "BYTES")]
     pub message_bytes: usize,
-    /// Frames a second from one publisher; a faster one is slowed down.
+    /// Messages a second from one publisher; a faster one is slowed down.
     #[arg(id = "max-fps", long = "max-fps", default_value_t = Self::default().frames_per_second, value_name = "N")]
     pub frames_per_second: u32,
     /// Bad frames in a row that end a publisher's session.
     #[arg(id = "max-bad-frames", long = "max-bad-frames", default_value_t = Self::default().bad_frames_in_a_row, value_name = "N")]
     pub bad_frames_in_a_row: u32,
-    /// Connections from one address; does not hold for loopback.
+    /// Connections altogether, each a file descriptor and about 16 KiB.
+    #[arg(id = "max-connections-in-all", long = "max-connections-in-all", default_value_t = Self::default().connections, value_name = "N")]
+    pub connections: usize,
+    /// Connections from one address, or one /64 of IPv6; does not hold for loopback.
     #[arg(id = "max-connections", long = "max-connections", default_value_t = Self::default().connections_per_address, value_name = "N")]
     pub connections_per_address: usize,
 }
@@ -104,6 +109,8 @@ impl Default for Limits {
             // Five percent of a core, and 16 times a fast face camera.
             frames_per_second: 1000,
             bad_frames_in_a_row: 100,
+            // A quarter of a gigabyte of viewers.
+            connections: 16_384,
             // A class behind one router.
             connections_per_address: 256,
         }
@@ -117,7 +124,7 @@ pub struct Timeouts {
     /// For a request's head, and for a publisher's hello.
     #[arg(id = "hello-timeout", long = "hello-timeout", default_value_t = Self::default().hello, value_name = "SECONDS")]
     pub hello: f64,
-    /// Between pings on a silent socket.
+    /// Between pings of a publisher, and of a viewer that gets no packets.
     #[arg(id = "ping-interval", long = "ping-interval", default_value_t = Self::default().ping, value_name = "SECONDS")]
     pub ping: f64,
     /// Without a sign of life from a publisher (frames or pongs).
@@ -126,7 +133,7 @@ pub struct Timeouts {
     /// Without a pong from a viewer; a laptop that slept for a minute is still there afterwards.
     #[arg(id = "viewer-timeout", long = "viewer-timeout", default_value_t = Self::default().viewer_idle, value_name = "SECONDS")]
     pub viewer_idle: f64,
-    /// For one write to get into the socket.
+    /// For a write to get anywhere, on a socket or in an answer over HTTP.
     #[arg(id = "write-timeout", long = "write-timeout", default_value_t = Self::default().write, value_name = "SECONDS")]
     pub write: f64,
     /// That a room stays without publisher and viewers.
@@ -144,10 +151,10 @@ impl Default for Timeouts {
 #[derive(Debug, Clone, PartialEq, Default, Deserialize, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 pub struct Access {
-    /// Host names under which this server may be asked for, besides loopback's (repeat for several).
+    /// Host names under which this server may be asked for, besides localhost and IP addresses (repeat for several).
     #[arg(long = "allow-host", value_name = "HOST")]
     pub hosts: Vec<String>,
-    /// Origins of other sites whose pages may use it, e.g. `https://example.org` (repeat for several).
+    /// Origins of other sites whose pages may use and read it, e.g. `https://example.org` (repeat for several).
     #[arg(long = "allow-origin", value_name = "ORIGIN")]
     pub origins: Vec<String>,
 }
@@ -157,7 +164,11 @@ impl ServerConfig {
     pub fn from_file(path: &Path) -> Result<Self, ServerConfigError> {
         let shown = path.display().to_string();
         let text = std::fs::read_to_string(path).map_err(|source| ServerConfigError::Io { path: shown.clone(), source })?;
-        toml::from_str(&text).map_err(|source| ServerConfigError::Toml { path: shown, source })
+        toml::from_str(&text).map_err(|error: toml::de::Error| ServerConfigError::Toml {
+            path: shown,
+            line: 1 + text.bytes().take(error.span().map_or(0, |span| span.start)).filter(|byte| *byte == b'\n').count(),
+            problem: error.message().lines().collect::<Vec<_>>().join(", "),
+        })
     }
 
     /// Checks every value.
@@ -168,6 +179,7 @@ impl ServerConfig {
             ("limits.viewers_per_room", limits.viewers_per_room, 1_000_000),
             ("limits.frames_per_second", limits.frames_per_second as usize, 1_000_000),
             ("limits.bad_frames_in_a_row", limits.bad_frames_in_a_row as usize, 1_000_000),
+            ("limits.connections", limits.connections, 1_000_000),
             ("limits.connections_per_address", limits.connections_per_address, 1_000_000),
         ] {
             if got == 0 || got > most {

@@ -3,7 +3,7 @@
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
 use std::fs::File;
-use std::io::{BufRead, BufReader, ErrorKind, Read};
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 /// Why a feed could not be read.
@@ -122,24 +122,24 @@ impl<R: BufRead> Feed<R> {
     /// Reads the next line that is not blank into `text`, without its end; false at the end of the feed.
     fn next_line(&mut self) -> Result<bool, FeedError> {
         loop {
-            self.text.clear();
             self.line += 1;
-            let most = MAX_MESSAGE_BYTES as u64 + 2;
-            let read = (&mut self.lines).take(most).read_line(&mut self.text);
-            let num_bytes = match read {
-                Ok(num_bytes) => num_bytes,
-                Err(error) if error.kind() == ErrorKind::InvalidData => {
-                    return Err(self.refuse(MessageError::new("malformed_json", "line is not UTF-8 text")));
-                }
-                Err(source) => return Err(FeedError::Io { path: self.path.clone(), source }),
-            };
+            let mut bytes = std::mem::take(&mut self.text).into_bytes();
+            bytes.clear();
+            // One more than the longest line and its end.
+            let most = MAX_MESSAGE_BYTES as u64 + 3;
+            let num_bytes = (&mut self.lines)
+                .take(most)
+                .read_until(b'\n', &mut bytes)
+                .map_err(|source| FeedError::Io { path: self.path.clone(), source })?;
             if num_bytes == 0 {
                 return Ok(false);
             }
-            self.text.truncate(self.text.trim_end_matches(['\n', '\r']).len());
-            if self.text.len() > MAX_MESSAGE_BYTES {
+            while bytes.pop_if(|byte| matches!(byte, b'\n' | b'\r')).is_some() {}
+            // Before its text is looked at: where a line is cut, a character may be.
+            if bytes.len() > MAX_MESSAGE_BYTES {
                 return Err(self.refuse(MessageError::new("too_long", format!("line is longer than {MAX_MESSAGE_BYTES} bytes"))));
             }
+            self.text = String::from_utf8(bytes).map_err(|_| self.refuse(MessageError::new("not_utf8", "line is not UTF-8 text")))?;
             if !self.text.trim().is_empty() {
                 return Ok(true);
             }
@@ -154,3 +154,55 @@ fn open(path: &Path) -> Result<(BufReader<File>, String), FeedError> {
 }
 
 const NO_HELLO: &str = "the first line must be {\"type\":\"hello\",\"version\":1,…}";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Cursor;
+
+    const HELLO: &str = "{\"type\":\"hello\",\"version\":1}\n";
+
+    /// What is wrong with the line after a hello.
+    fn problem(line: &[u8]) -> String {
+        let bytes = [HELLO.as_bytes(), line].concat();
+        let mut feed = Feed::new_for_any_character(Cursor::new(bytes), "feed".into()).unwrap();
+        feed.next_frame(&mut TrackingFrame::default()).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn an_empty_feed_has_no_hello() {
+        for text in ["", "\n \r\n\n"] {
+            let Err(error) = Feed::new_for_any_character(Cursor::new(text), "feed".into()) else { panic!("{text:?} is no feed") };
+            assert!(error.to_string().starts_with("feed feed, line 1: the feed is empty, the first line must be"), "{error}");
+        }
+    }
+
+    #[test]
+    fn the_longest_line_is_taken_and_a_longer_one_is_called_long_whatever_it_holds() {
+        let line = |len: usize, pad: &str| {
+            let start = "{\"type\":\"frame\",\"t\":0,\"face\":false,\"pad\":\"";
+            let pad = pad.repeat((len - start.len() - 2) / pad.len());
+            format!("{start}{pad}{}\"}}", "x".repeat(len - start.len() - 2 - pad.len()))
+        };
+        let longest = line(MAX_MESSAGE_BYTES, "x");
+        assert_eq!(longest.len(), MAX_MESSAGE_BYTES);
+        for end in ["", "\n", "\r\n"] {
+            let feed = format!("{HELLO}{longest}{end}");
+            let mut feed = Feed::new_for_any_character(Cursor::new(feed), "feed".into()).unwrap();
+            assert_eq!(feed.next_frame(&mut TrackingFrame::default()).unwrap(), Some(FeedItem::Frame), "{end:?}");
+        }
+        let expected = format!("feed feed, line 2: line is longer than {MAX_MESSAGE_BYTES} bytes");
+        // Four bytes a character: at three of the four lengths the cut goes through one.
+        for more in 1..=8 {
+            for end in ["", "\n", "\r\n"] {
+                assert_eq!(problem(format!("{}{end}", line(MAX_MESSAGE_BYTES + more, "x")).as_bytes()), expected, "{more} {end:?}");
+                assert_eq!(problem(format!("{}{end}", line(MAX_MESSAGE_BYTES + more, "😀")).as_bytes()), expected, "{more} {end:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_line_that_is_not_text_is_called_so() {
+        assert_eq!(problem(b"\xff\xfe\n"), "feed feed, line 2: line is not UTF-8 text");
+    }
+}

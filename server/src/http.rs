@@ -1,16 +1,18 @@
 //! What is asked for over HTTP: pages, listings, the character, and the two kinds of WebSocket.
 
+use crate::config::Access;
 use crate::service::{Hub, Peer};
-use crate::socket::{Ending, ErrorMessage, close, upgrade};
+use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
 use crate::{publish, viewer};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{Path, Request, State};
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use rhytid_shared::RoomName;
+use std::net::IpAddr;
 use std::sync::Arc;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
@@ -30,10 +32,23 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
 }
 
 /// Browsers carry other sites' pages: a request with an `Origin` must come from this server's own page or an allowed site, and
-/// a server on loopback must be asked for by a name of loopback's, or a page elsewhere could reach it by a name that points here.
+/// the server must be asked for by an address or a name it is known by, or a page elsewhere could reach it by a name of its
+/// own that points here.
 async fn check_browser(State(hub): State<Arc<Hub>>, request: Request, next: Next) -> Response {
-    match check_names(request.headers(), &hub) {
-        Ok(()) => next.run(request).await,
+    let access = &hub.config.access;
+    match check_names(request.headers(), access, hub.listens_on_loopback) {
+        Ok(()) => {
+            let origin = request.headers().get(header::ORIGIN).filter(|origin| is_allowed_origin(origin, access)).cloned();
+            let mut response = next.run(request).await;
+            if !access.origins.is_empty() {
+                response.headers_mut().append(header::VARY, HeaderValue::from_static("origin"));
+            }
+            // A page of an allowed site may also read what it gets.
+            if let Some(origin) = origin {
+                response.headers_mut().insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, origin);
+            }
+            response
+        }
         Err(error) => {
             hub.metrics.end(error.code);
             tracing::warn!(code = error.code, message = error.message, "browser request refused");
@@ -42,33 +57,37 @@ async fn check_browser(State(hub): State<Arc<Hub>>, request: Request, next: Next
     }
 }
 
-fn check_names(headers: &HeaderMap, hub: &Hub) -> Result<(), ErrorMessage> {
-    let access = &hub.config.access;
+fn check_names(headers: &HeaderMap, access: &Access, listens_on_loopback: bool) -> Result<(), ErrorMessage> {
     let shown = |text: &str| text.chars().take(80).collect::<String>();
     let host = headers.get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
     let name = host_name(host);
     let is_listed = access.hosts.iter().any(|allowed| allowed.eq_ignore_ascii_case(name));
-    let asks_for_loopback =
-        name.eq_ignore_ascii_case("localhost") || name.trim_matches(['[', ']']).parse().is_ok_and(|ip: std::net::IpAddr| ip.is_loopback());
-    // Elsewhere than on loopback any name will do, unless the user listed some.
-    let is_free = !hub.listens_on_loopback && access.hosts.is_empty();
-    if !(is_listed || asks_for_loopback || is_free) {
+    let is_known = match name.trim_matches(['[', ']']).parse::<IpAddr>() {
+        // Nobody can make an address point elsewhere.
+        Ok(address) => address.is_loopback() || !listens_on_loopback,
+        Err(_) => name.eq_ignore_ascii_case("localhost"),
+    };
+    if !is_listed && !is_known {
         let message =
-            format!("header Host is {:?}, expected a name of this server (localhost, or one given with --allow-host)", shown(host));
+            format!("header Host is {:?}, expected localhost, an address of this server or a name given with --allow-host", shown(host));
         return Err(ErrorMessage::new("forbidden_host", message));
     }
     let Some(origin) = headers.get(header::ORIGIN) else { return Ok(()) };
-    let origin = origin.to_str().unwrap_or_default();
-    let is_own = origin.split_once("://").is_some_and(|(_, origin_host)| origin_host.eq_ignore_ascii_case(host));
-    if is_own || access.origins.iter().any(|allowed| allowed.eq_ignore_ascii_case(origin)) {
+    let shown_origin = origin.to_str().unwrap_or_default();
+    let is_own = shown_origin.split_once("://").is_some_and(|(_, origin_host)| origin_host.eq_ignore_ascii_case(host));
+    if is_own || is_allowed_origin(origin, access) {
         return Ok(());
     }
     let message = format!(
         "header Origin is {:?}, expected this server's own page (Host {:?}) or one given with --allow-origin",
-        shown(origin),
+        shown(shown_origin),
         shown(host)
     );
     Err(ErrorMessage::new("forbidden_origin", message))
+}
+
+fn is_allowed_origin(origin: &HeaderValue, access: &Access) -> bool {
+    access.origins.iter().any(|allowed| allowed.as_bytes().eq_ignore_ascii_case(origin.as_bytes()))
 }
 
 /// `host` without its port.
@@ -84,8 +103,15 @@ async fn page() -> Html<&'static str> {
     Html(include_str!("page.html"))
 }
 
-async fn metrics(State(hub): State<Arc<Hub>>) -> Response {
-    ([(header::CONTENT_TYPE, "application/openmetrics-text; version=1.0.0; charset=utf-8")], hub.metrics.text()).into_response()
+/// In Prometheus's own format, or as OpenMetrics where the reader names that.
+async fn metrics(State(hub): State<Arc<Hub>>, headers: HeaderMap) -> Response {
+    let mut accepted = headers.get_all(header::ACCEPT).into_iter().filter_map(|value| value.to_str().ok());
+    let (kind, text) = if accepted.any(|value| value.contains("application/openmetrics-text")) {
+        ("application/openmetrics-text; version=1.0.0; charset=utf-8", hub.metrics.open_metrics())
+    } else {
+        ("text/plain; version=0.0.4; charset=utf-8", hub.metrics.prometheus())
+    };
+    ([(header::CONTENT_TYPE, kind)], text).into_response()
 }
 
 async fn rooms(State(hub): State<Arc<Hub>>) -> Response {
@@ -116,8 +142,12 @@ async fn publish_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, r
         Err(error) => return error.response(StatusCode::BAD_REQUEST),
     };
     tracing::debug!(%room, peer = ?request.extensions().get::<Peer>(), "publisher connects");
+    let handshake = match Handshake::check(&request) {
+        Ok(handshake) => handshake,
+        Err(answer) => return *answer,
+    };
     let config = publish::socket_config(&hub);
-    upgrade(request, config, Vec::new(), move |socket| publish::talk(hub, socket, room))
+    upgrade(&hub.clone(), request, handshake, config, Vec::new(), move |socket| publish::talk(hub, socket, room))
 }
 
 async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
@@ -132,17 +162,23 @@ async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, requ
         return ErrorMessage::new("unknown_format", message).response(StatusCode::BAD_REQUEST);
     }
     let wants_json = format == "json";
+    // Before the room: what is no handshake makes none.
+    let handshake = match Handshake::check(&request) {
+        Ok(handshake) => handshake,
+        Err(answer) => return *answer,
+    };
     tracing::debug!(%room, wants_json, peer = ?request.extensions().get::<Peer>(), "viewer connects");
     match hub.rooms.join(&room) {
         Ok(viewing) => {
             let first = viewer::first_frames(&hub, &room);
-            upgrade(request, viewer::socket_config(), first, move |socket| viewer::talk(hub, socket, viewing, wants_json))
+            let config = viewer::socket_config();
+            upgrade(&hub.clone(), request, handshake, config, first, move |socket| viewer::talk(hub, socket, viewing, wants_json))
         }
         // A browser's page cannot read the answer to a handshake, so the refusal is a message.
         Err(error) => {
             let ending = Ending::error(CloseCode::Again, ErrorMessage::new(error.code(), error.to_string()));
             hub.metrics.end(error.code());
-            upgrade(request, viewer::socket_config(), Vec::new(), async move |socket| close(socket, &ending).await)
+            upgrade(&hub, request, handshake, viewer::socket_config(), Vec::new(), async move |socket| close(socket, &ending).await)
         }
     }
 }

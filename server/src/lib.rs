@@ -17,6 +17,7 @@ mod send;
 mod service;
 mod socket;
 pub mod solve;
+mod stream;
 mod viewer;
 
 pub use clip::{ClipError, clip_feed};

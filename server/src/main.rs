@@ -1,19 +1,22 @@
 //! The server's command line: `serve` and `send`.
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
-use rhytid_server::{Access, Limits, SendOptions, SendSource, ServerConfig, Timeouts, bind, clip_feed, load_character, run, send};
+use rhytid_server::{
+    Access, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, bind, clip_feed, load_character, run, send,
+};
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 use tracing_subscriber::EnvFilter;
 
 /// Turns what a face tracker sees into a moving, wrinkled face and streams it to viewers.
 #[derive(Parser)]
 #[command(version, about)]
 struct Cli {
-    /// Say more: -v what happens, -vv every connection and bad message.
+    /// Say more: -v every connection and bad message, -vv also what libraries do.
     #[arg(short, long, action = clap::ArgAction::Count, global = true)]
     verbose: u8,
     /// Write the log as JSON, one object a line.
@@ -76,6 +79,9 @@ struct SendArgs {
     /// Take the room over from another publisher.
     #[arg(long)]
     takeover: bool,
+    /// How long the server may take to accept the connection, to answer the hello, and to read a message.
+    #[arg(long, default_value = "15", value_name = "SECONDS", value_parser = parse_seconds)]
+    timeout: Duration,
 }
 
 fn parse_speed(text: &str) -> Result<f64, String> {
@@ -84,6 +90,11 @@ fn parse_speed(text: &str) -> Result<f64, String> {
         Ok(speed) if speed > 0.0 && speed.is_finite() => Ok(speed),
         _ => Err("expected a number more than 0, or max".into()),
     }
+}
+
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse().ok().filter(|seconds| (0.01..=86_400.0).contains(seconds));
+    seconds.map(Duration::from_secs_f64).ok_or_else(|| "expected seconds from 0.01 to 86400".into())
 }
 
 #[tokio::main]
@@ -111,8 +122,9 @@ async fn main() -> ExitCode {
 fn start_log(cli: &Cli) {
     let level = match (cli.verbose, &cli.command) {
         (0, Command::Send(_)) => "warn",
-        (0, Command::Serve(_)) | (1, _) => "rhytid_server=info,warn",
-        _ => "rhytid_server=debug,info",
+        (0, Command::Serve(_)) => "rhytid_server=info,warn",
+        (1, _) => "rhytid_server=debug,info",
+        _ => "debug",
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
@@ -139,6 +151,7 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "max-message": limits.message_bytes,
         "max-fps": limits.frames_per_second,
         "max-bad-frames": limits.bad_frames_in_a_row,
+        "max-connections-in-all": limits.connections,
         "max-connections": limits.connections_per_address,
         "hello-timeout": timeouts.hello,
         "ping-interval": timeouts.ping,
@@ -155,11 +168,14 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
 
     let mut interrupt = Signals::new().context("cannot wait for signals")?;
     // Before the port is bound: who sees the line below may connect, and a broken character must not leave a port behind.
-    load_character(config.character.as_deref())?;
+    let character = load_character(config.character.as_deref())?;
     let listener = bind(&config.listen).await?;
-    println!("listening on http://{}", listener.local_addr()?);
-    std::io::stdout().flush()?;
-    run(listener, config, async move { interrupt.wait().await }).await?;
+    let mut output = std::io::stdout();
+    if let Err(error) = writeln!(output, "listening on http://{}", listener.local_addr()?).and_then(|()| output.flush()) {
+        // Who closed it does not want to know; who connects is served all the same.
+        tracing::warn!(%error, "cannot write to standard output");
+    }
+    run(listener, config, character, async move { interrupt.wait().await }).await?;
     Ok(())
 }
 
@@ -223,17 +239,20 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
     let progress = ProgressBar::new(0);
     progress
         .set_style(ProgressStyle::with_template("{elapsed_precise} [{bar:40}] {percent:>3}% {bytes}/{total_bytes}")?.progress_chars("=> "));
-    let options = SendOptions { source, to: args.to, room: args.room, speed: args.speed, repeats: args.repeats, takeover: args.takeover };
-    let mut interrupt = Signals::new().context("cannot wait for signals")?;
-    let report = tokio::select! {
-        report = send(&options, &progress) => report,
-        () = interrupt.wait() => {
-            progress.abandon();
-            return Ok(());
-        }
+    let options = SendOptions {
+        source,
+        to: args.to,
+        room: args.room,
+        speed: args.speed,
+        repeats: args.repeats,
+        takeover: args.takeover,
+        timeout: args.timeout,
     };
+    let mut interrupt = Signals::new().context("cannot wait for signals")?;
+    let report = send(&options, &progress, async move { interrupt.wait().await }).await;
     progress.finish_and_clear();
-    let report = report?;
-    eprintln!("sent {} frames, {} refused", report.frames, report.errors);
+    let SendReport { frames, errors } = report?;
+    ensure!(errors == 0, "sent {frames} frames, of all messages the server refused {errors}");
+    eprintln!("sent {frames} frames, none refused");
     Ok(())
 }

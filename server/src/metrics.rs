@@ -7,6 +7,7 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Registry, Unit};
+use std::collections::BTreeSet;
 
 /// Label of a count by reason.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
@@ -17,6 +18,7 @@ pub(crate) struct Reason {
 /// Every counter of the service.
 pub(crate) struct Metrics {
     registry: Registry,
+    pub connections: Gauge,
     pub rooms: Gauge,
     pub publishers: Gauge,
     pub viewers: Gauge,
@@ -33,6 +35,7 @@ impl Metrics {
     pub fn new() -> Self {
         let mut registry = Registry::with_prefix("rhytid");
         let metrics = Self {
+            connections: Gauge::default(),
             rooms: Gauge::default(),
             publishers: Gauge::default(),
             viewers: Gauge::default(),
@@ -46,6 +49,7 @@ impl Metrics {
             refused: Family::default(),
             registry: Registry::default(),
         };
+        registry.register("connections", "Connections that are open", metrics.connections.clone());
         registry.register("rooms", "Rooms that exist", metrics.rooms.clone());
         registry.register("publishers", "Publishers connected", metrics.publishers.clone());
         registry.register("viewers", "Viewers connected", metrics.viewers.clone());
@@ -55,7 +59,7 @@ impl Metrics {
         registry.register_with_unit("out", "Payload sent to viewers", Unit::Bytes, metrics.bytes_out.clone());
         registry.register_with_unit("solve", "Time to solve one frame", Unit::Seconds, metrics.solve_seconds.clone());
         registry.register("frames_dropped", "Frames that were refused, or that a slow viewer skipped, by reason", metrics.dropped.clone());
-        registry.register("sessions_ended", "Sockets refused or ended by the server, by reason", metrics.refused.clone());
+        registry.register("sessions_ended", "Sockets refused or ended by either side, by reason", metrics.refused.clone());
         let metrics = Self { registry, ..metrics };
         // Listed from the start, with its zero.
         metrics.drop_frames("slow_viewer", 0);
@@ -67,15 +71,36 @@ impl Metrics {
         self.dropped.get_or_create(&Reason { reason }).inc_by(count);
     }
 
-    /// Counts a socket that the server refused or ended.
+    /// Counts a socket that was refused, or ended by either side.
     pub fn end(&self, reason: &'static str) {
         self.refused.get_or_create(&Reason { reason }).inc();
     }
 
-    /// The text that a Prometheus server scrapes.
-    pub fn text(&self) -> String {
+    /// In the OpenMetrics text format, version 1.0.0.
+    pub fn open_metrics(&self) -> String {
         let mut text = String::new();
         encode(&mut text, &self.registry).expect("writing to a String cannot fail");
+        text
+    }
+
+    /// In Prometheus's own text format, version 0.0.4. It differs in that a counter's family is called as its samples are, and
+    /// that it knows neither units nor an end.
+    pub fn prometheus(&self) -> String {
+        let open_metrics = self.open_metrics();
+        let counters: BTreeSet<&str> =
+            open_metrics.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.strip_suffix(" counter")).collect();
+        let mut text = String::with_capacity(open_metrics.len() + 256);
+        for line in open_metrics.lines() {
+            let mut words = line.splitn(4, ' ');
+            match (words.next(), words.next(), words.next(), words.next()) {
+                (Some("#"), Some("UNIT" | "EOF"), ..) => continue,
+                (Some("#"), Some(kind), Some(family), Some(rest)) if counters.contains(family) => {
+                    text.push_str(&format!("# {kind} {family}_total {rest}"));
+                }
+                _ => text.push_str(line),
+            }
+            text.push('\n');
+        }
         text
     }
 }

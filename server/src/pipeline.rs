@@ -27,6 +27,11 @@ impl Pipeline {
         })
     }
 
+    /// Numbers the session, where its number is known only after the pipeline stands.
+    pub(crate) fn set_session(&mut self, session: u32) {
+        self.session = session;
+    }
+
     /// Solves `frame` and writes its packet into `packet`, which is emptied first. Every frame that the solve takes gives one
     /// packet.
     pub fn frame(&mut self, frame: &TrackingFrame, packet: &mut Vec<u8>) -> Result<PacketKind, SolveError> {

@@ -2,21 +2,21 @@
 
 use crate::config::seconds;
 use crate::pipeline::Pipeline;
-use crate::room::{Publishing, RoomError};
+use crate::room::{Evicted, Publishing, RoomError};
 use crate::service::{Hub, stopped};
-use crate::socket::{Ending, ErrorMessage, Socket, Stop, close, farewell, send, send_json};
+use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
 use crate::solve::DelayReport;
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
 use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
 use serde::Serialize;
-use std::sync::Arc;
+use std::convert::Infallible;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::time::Instant;
-use tokio_tungstenite::tungstenite::error::CapacityError;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
-use tokio_tungstenite::tungstenite::{Bytes, Error, Message};
+use tokio_tungstenite::tungstenite::{Bytes, Message, Utf8Bytes};
 
 /// Answers to a publisher, besides errors.
 #[derive(Debug, Serialize)]
@@ -56,32 +56,65 @@ pub(crate) fn socket_config(hub: &Hub) -> WebSocketConfig {
         .max_frame_size(Some(most))
 }
 
+/// Calibrations a second from one publisher: each may solve all its frames of the last seconds anew.
+const CALIBRATIONS_PER_SECOND: u32 = 2;
+
 /// Takes a publisher's messages until one side ends it.
 pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName) {
-    let stop = match Session::begin(&hub, &mut socket, &room).await {
-        Ok(mut session) => match session.run(&mut socket).await {
-            Ok(never) => match never {},
-            Err(stop) => {
-                tracing::info!(%room, session = session.place.session, frames = session.num_frames, "publisher gone");
-                stop
-            }
+    let Err(stop) = publish(&hub, &mut socket, &room).await;
+    if let Stop::End(ending) = &stop {
+        tracing::info!(%room, reason = %ending.reason, "publisher ended by the server");
+    }
+    end(socket, stop, &hub.metrics).await;
+}
+
+/// Waits for the hello, claims the room and takes messages, however long each step may block, until the session ends, the
+/// service ends, another publisher takes the room, or nothing is heard any more.
+async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infallible, Stop> {
+    let timeouts = &hub.config.timeouts;
+    let mut shutdown = hub.shutdown.clone();
+    let mut reader = PublishReader::new(&hub.character);
+    let hello = tokio::select! {
+        biased;
+        () = stopped(&mut shutdown) => return Err(Ending::shutdown().into()),
+        hello = tokio::time::timeout(seconds(timeouts.hello), read_hello(hub, socket, &mut reader)) => match hello {
+            Ok(hello) => hello?,
+            Err(_) => return Err(refusal("hello_timeout", format!("no hello within {} seconds", timeouts.hello))),
         },
-        Err(stop) => stop,
     };
-    match stop {
-        Stop::End(ending) => {
-            tracing::info!(%room, reason = %ending.reason, "publisher ended by the server");
-            hub.metrics.end(ending.error.as_ref().map_or("shutdown", |error| error.code));
-            close(socket, &ending).await;
+    // Before the room is claimed: a hello that leads to nothing takes no room from anybody.
+    let mut pipeline = Pipeline::new(hub.character.clone(), &hub.config.solve, &hello, 0)
+        .map_err(|error| refusal("bad_hello", format!("hello: {error}")))?;
+    let (place, evicted) = claim(hub, room, &hello)?;
+    pipeline.set_session(place.session);
+    tracing::info!(%room, session = place.session, source = hello.source, takeover = hello.takeover, "publisher ready");
+    let heard = Heard::now();
+    let mut session = Session::new(hub, place, pipeline, reader);
+    let stop = tokio::select! {
+        biased;
+        () = stopped(&mut shutdown) => Ending::shutdown().into(),
+        _ = evicted => taken_over(),
+        result = session.run(socket, &heard) => match result { Err(stop) => stop },
+        () = heard.silence(seconds(timeouts.publisher_idle)) => {
+            refusal("idle", format!("nothing heard for {} seconds", timeouts.publisher_idle))
         }
-        Stop::Gone(reason) => {
-            hub.metrics.end(reason);
-            farewell(socket).await;
-        }
+    };
+    tracing::info!(%room, session = session.place.session, frames = session.num_frames, "publisher gone");
+    Err(stop)
+}
+
+/// Reads up to the hello.
+async fn read_hello(hub: &Hub, socket: &mut Socket, reader: &mut PublishReader) -> Result<PublishHello, Stop> {
+    let text = first_text(socket, hub).await?;
+    hub.metrics.bytes_in.inc_by(text.len() as u64);
+    match reader.read(&text, &mut TrackingFrame::default()) {
+        Ok(PublishMessage::Hello(hello)) => Ok(hello),
+        Ok(PublishMessage::Frame | PublishMessage::Calibrate) => unreachable!("the reader refuses both before a hello"),
+        Err(MessageError { code, message }) => Err(refusal(code, message)),
     }
 }
 
-/// A publisher that has said its hello.
+/// A publisher that has claimed its room.
 struct Session<'a> {
     hub: &'a Hub,
     place: Publishing,
@@ -89,109 +122,89 @@ struct Session<'a> {
     reader: PublishReader,
     frame: TrackingFrame,
     packet: Vec<u8>,
-    rate: Rate,
-    liveness: Liveness,
+    messages: Rate,
+    calibrations: Rate,
+    /// The sender knows that it is too fast.
+    has_told_rate: bool,
     num_frames: u64,
     num_bad_in_a_row: u32,
 }
 
 impl<'a> Session<'a> {
-    /// Waits for the hello and claims the room.
-    async fn begin(hub: &'a Hub, socket: &mut Socket, room: &RoomName) -> Result<Self, Stop> {
-        let timeout = seconds(hub.config.timeouts.hello);
-        let mut reader = PublishReader::new(&hub.character);
-        let mut frame = TrackingFrame::default();
-        let mut shutdown = hub.shutdown.clone();
-        let text = tokio::select! {
-            () = stopped(&mut shutdown) => return Err(Ending::shutdown().into()),
-            text = tokio::time::timeout(timeout, first_text(socket, hub)) => match text {
-                Ok(text) => text?,
-                Err(_) => {
-                    let message = format!("no hello within {} seconds", hub.config.timeouts.hello);
-                    return Err(Ending::error(CloseCode::Policy, ErrorMessage::new("hello_timeout", message)).into());
-                }
-            },
-        };
-        hub.metrics.bytes_in.inc_by(text.len() as u64);
-        let refuse = |error: MessageError| Stop::from(Ending::error(CloseCode::Policy, ErrorMessage::new(error.code, error.message)));
-        let hello = match reader.read(&text, &mut frame).map_err(refuse)? {
-            PublishMessage::Hello(hello) => hello,
-            PublishMessage::Frame | PublishMessage::Calibrate => unreachable!("the reader refuses both before a hello"),
-        };
-        let place = claim(hub, room, &hello)?;
-        let pipeline = Pipeline::new(hub.character.clone(), &hub.config.solve, &hello, place.session)
-            .map_err(|error| Stop::from(Ending::error(CloseCode::Policy, ErrorMessage::new("bad_hello", format!("hello: {error}")))))?;
-        tracing::info!(%room, session = place.session, source = hello.source, takeover = hello.takeover, "publisher ready");
-        let ready = Answer::Ready {
-            version: PROTOCOL_VERSION,
-            room: room.as_str(),
-            session: place.session,
-            character: &hub.character.name,
-            bones: hub.character.bones.iter().map(|bone| bone.name.as_str()).collect(),
-        };
-        send_json(socket, &ready, seconds(hub.config.timeouts.write)).await?;
+    fn new(hub: &'a Hub, place: Publishing, pipeline: Pipeline, reader: PublishReader) -> Self {
         let now = Instant::now();
-        Ok(Self {
+        Self {
             hub,
             place,
             pipeline,
             reader,
-            frame,
+            frame: TrackingFrame::default(),
             packet: Vec::new(),
-            rate: Rate::new(hub.config.limits.frames_per_second, now),
-            liveness: Liveness { last_heard: now, last_ping: now },
+            messages: Rate::new(hub.config.limits.frames_per_second, now),
+            calibrations: Rate::new(CALIBRATIONS_PER_SECOND, now),
+            has_told_rate: false,
             num_frames: 0,
             num_bad_in_a_row: 0,
-        })
+        }
     }
 
-    /// Takes messages until the session ends.
-    async fn run(&mut self, socket: &mut Socket) -> Result<std::convert::Infallible, Stop> {
+    /// Says that it is ready and takes messages until the session ends. May be dropped at any await.
+    async fn run(&mut self, socket: &mut Socket, heard: &Heard) -> Result<Infallible, Stop> {
+        let character = &self.hub.character;
+        let ready = Answer::Ready {
+            version: PROTOCOL_VERSION,
+            room: self.place.room.name.as_str(),
+            session: self.place.session,
+            character: &character.name,
+            bones: character.bones.iter().map(|bone| bone.name.as_str()).collect(),
+        };
         let timeouts = &self.hub.config.timeouts;
-        let (ping, idle, write) = (seconds(timeouts.ping), seconds(timeouts.publisher_idle), seconds(timeouts.write));
-        let mut shutdown = self.hub.shutdown.clone();
+        let (ping, write) = (seconds(timeouts.ping), seconds(timeouts.write));
+        send_json(socket, &ready, write).await?;
+        let mut last_ping = Instant::now();
         loop {
-            let wake = (self.liveness.last_ping + ping).min(self.liveness.last_heard + idle);
-            tokio::select! {
-                () = stopped(&mut shutdown) => return Err(Ending::shutdown().into()),
-                _ = &mut self.place.evicted => return Err(taken_over()),
-                message = socket.next() => {
-                    self.liveness.last_heard = Instant::now();
-                    let text = match message {
-                        Some(Ok(Message::Text(text))) => text,
-                        Some(Ok(Message::Binary(_))) => {
-                            self.refuse(socket, ErrorMessage::new("binary_message", BINARY)).await?;
-                            continue;
-                        }
-                        Some(Ok(Message::Close(_))) | None => return Err(Stop::Gone("closed")),
-                        Some(Ok(_)) => continue,
-                        Some(Err(error)) => return Err(broken(error, self.hub)),
-                    };
+            let message = tokio::select! {
+                message = socket.next() => message,
+                () = tokio::time::sleep_until(last_ping + ping) => {
+                    last_ping = Instant::now();
+                    send(socket, Message::Ping(Bytes::new()), write).await?;
+                    continue;
+                }
+            };
+            heard.set(Instant::now());
+            match message {
+                Some(Ok(Message::Text(text))) => {
                     self.hub.metrics.bytes_in.inc_by(text.len() as u64);
                     self.take(socket, &text).await?;
                 }
-                () = tokio::time::sleep_until(wake) => {
-                    let now = Instant::now();
-                    if now >= self.liveness.last_heard + idle {
-                        let message = format!("nothing heard for {} seconds", timeouts.publisher_idle);
-                        return Err(Ending::error(CloseCode::Policy, ErrorMessage::new("idle", message)).into());
-                    }
-                    self.liveness.last_ping = now;
-                    send(socket, Message::Ping(Bytes::new()), write).await?;
+                Some(Ok(Message::Binary(bytes))) => {
+                    self.hub.metrics.bytes_in.inc_by(bytes.len() as u64);
+                    self.refuse(socket, ErrorMessage::new("binary_message", BINARY)).await?;
                 }
+                Some(Ok(Message::Close(_))) | None => return Err(Stop::Gone("closed")),
+                Some(Ok(_)) => {}
+                Some(Err(error)) => return Err(broken(error, self.hub.config.limits.message_bytes)),
             }
+            self.hold_back(socket, heard).await?;
         }
     }
 
     /// Takes one text message.
     async fn take(&mut self, socket: &mut Socket, text: &str) -> Result<(), Stop> {
-        let write = seconds(self.hub.config.timeouts.write);
         match self.reader.read(text, &mut self.frame) {
-            Ok(PublishMessage::Calibrate) => self.pipeline.calibrate(),
+            Ok(PublishMessage::Calibrate) => {
+                if self.calibrations.take_if_free(Instant::now()) {
+                    self.pipeline.calibrate();
+                } else {
+                    let message = format!("more than {CALIBRATIONS_PER_SECOND} calibrations a second: this one is left out");
+                    return self.refuse(socket, ErrorMessage::new("too_many_calibrations", message)).await;
+                }
+            }
             Ok(PublishMessage::Hello(_)) => unreachable!("the reader refuses a second hello"),
             Ok(PublishMessage::Frame) => {
                 let start = std::time::Instant::now();
                 if let Err(error) = self.pipeline.solve(&self.frame) {
+                    self.reader.take_back();
                     return self.refuse(socket, ErrorMessage::new("bad_frame", error.to_string())).await;
                 }
                 self.hub.metrics.solve_seconds.observe(start.elapsed().as_secs_f64());
@@ -202,7 +215,6 @@ impl<'a> Session<'a> {
                 self.hub.metrics.frames_in.inc();
                 self.num_frames += 1;
                 self.num_bad_in_a_row = 0;
-                self.hold_back(socket).await?;
             }
             Err(error) => return self.refuse(socket, ErrorMessage::new(error.code, error.message)).await,
         }
@@ -213,19 +225,22 @@ impl<'a> Session<'a> {
                 requested: report.requested,
                 added_delay: self.pipeline.added_delay(),
             };
-            send_json(socket, &answer, write).await?;
+            send_json(socket, &answer, seconds(self.hub.config.timeouts.write)).await?;
         }
         Ok(())
     }
 
-    /// Slows a sender that is too fast: nothing is read meanwhile, so its own socket fills up. Its frames are not dropped.
-    async fn hold_back(&mut self, socket: &mut Socket) -> Result<(), Stop> {
-        let Some(until) = self.rate.take(Instant::now()) else { return Ok(()) };
-        if !std::mem::replace(&mut self.rate.has_told, true) {
+    /// Slows a sender that is too fast, whatever it sends: nothing is read meanwhile, so its own socket fills up. Its frames
+    /// are not dropped.
+    async fn hold_back(&mut self, socket: &mut Socket, heard: &Heard) -> Result<(), Stop> {
+        let Some(until) = self.messages.take(Instant::now()) else { return Ok(()) };
+        if !std::mem::replace(&mut self.has_told_rate, true) {
             let most = self.hub.config.limits.frames_per_second;
-            let message = format!("more than {most} frames a second: the server reads no faster, no frame is dropped");
+            let message = format!("more than {most} messages a second: the server reads no faster, no frame is dropped");
             send_json(socket, &ErrorMessage::new("too_fast", message), seconds(self.hub.config.timeouts.write)).await?;
         }
+        // The silence until then is the server's own.
+        heard.set(until);
         tokio::time::sleep_until(until).await;
         Ok(())
     }
@@ -238,8 +253,7 @@ impl<'a> Session<'a> {
         send_json(socket, &error, seconds(self.hub.config.timeouts.write)).await?;
         let most = self.hub.config.limits.bad_frames_in_a_row;
         if self.num_bad_in_a_row >= most {
-            let message = format!("{most} bad messages in a row, the last one: {}", error.message);
-            return Err(Ending::error(CloseCode::Policy, ErrorMessage::new("too_many_bad_frames", message)).into());
+            return Err(refusal("too_many_bad_frames", format!("{most} bad messages in a row, the last one: {}", error.message)));
         }
         Ok(())
     }
@@ -248,7 +262,7 @@ impl<'a> Session<'a> {
 const BINARY: &str = "message is binary, expected JSON text";
 
 /// The first text message.
-async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<tokio_tungstenite::tungstenite::Utf8Bytes, Stop> {
+async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<Utf8Bytes, Stop> {
     loop {
         match socket.next().await {
             Some(Ok(Message::Text(text))) => return Ok(text),
@@ -257,12 +271,12 @@ async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<tokio_tungstenite:
             }
             Some(Ok(Message::Close(_))) | None => return Err(Stop::Gone("closed")),
             Some(Ok(_)) => {}
-            Some(Err(error)) => return Err(broken(error, hub)),
+            Some(Err(error)) => return Err(broken(error, hub.config.limits.message_bytes)),
         }
     }
 }
 
-fn claim(hub: &Hub, room: &RoomName, hello: &PublishHello) -> Result<Publishing, Stop> {
+fn claim(hub: &Hub, room: &RoomName, hello: &PublishHello) -> Result<(Publishing, Evicted), Stop> {
     hub.rooms.claim(room, &hello.source, hello.takeover).map_err(|error| {
         let code = match error {
             RoomError::Taken => CloseCode::Policy,
@@ -272,51 +286,68 @@ fn claim(hub: &Hub, room: &RoomName, hello: &PublishHello) -> Result<Publishing,
     })
 }
 
-fn taken_over() -> Stop {
-    Ending::error(CloseCode::Policy, ErrorMessage::new("taken_over", "another publisher has taken the room over")).into()
+/// The end of a publisher that does not keep the rules.
+fn refusal(code: &'static str, message: String) -> Stop {
+    Ending::error(CloseCode::Policy, ErrorMessage::new(code, message)).into()
 }
 
-/// What a broken stream of messages means for its sender.
-fn broken(error: Error, hub: &Hub) -> Stop {
-    match error {
-        Error::Capacity(CapacityError::MessageTooLong { size, .. }) => {
-            let message = format!("message has {size} bytes or more, at most {} are allowed", hub.config.limits.message_bytes);
-            Ending::error(CloseCode::Size, ErrorMessage::new("too_long", message)).into()
+fn taken_over() -> Stop {
+    refusal("taken_over", "another publisher has taken the room over".into())
+}
+
+/// When the peer was last heard.
+struct Heard(Mutex<Instant>);
+
+impl Heard {
+    fn now() -> Self {
+        Self(Mutex::new(Instant::now()))
+    }
+
+    fn set(&self, at: Instant) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = at;
+    }
+
+    /// Done when nothing has been heard for `idle`.
+    async fn silence(&self, idle: Duration) {
+        loop {
+            let due = *self.0.lock().unwrap_or_else(PoisonError::into_inner) + idle;
+            if due <= Instant::now() {
+                return;
+            }
+            tokio::time::sleep_until(due).await;
         }
-        Error::Utf8(_) => Ending::error(CloseCode::Invalid, ErrorMessage::new("not_utf8", "text message is not UTF-8")).into(),
-        Error::Protocol(error) => Ending::error(CloseCode::Protocol, ErrorMessage::new("protocol", error.to_string())).into(),
-        _ => Stop::Gone("connection_lost"),
     }
 }
 
-/// When the peer was last heard and pinged.
-struct Liveness {
-    last_heard: Instant,
-    last_ping: Instant,
-}
-
-/// Frames a second, with a burst of a tenth of a second.
+/// So many a second, with a burst of a tenth of a second or of two.
 struct Rate {
     interval: Duration,
     burst: Duration,
-    /// When the frames so far would have come at the allowed rate.
+    /// When what came so far would have come at the allowed rate.
     due: Instant,
-    /// The sender knows that it is too fast.
-    has_told: bool,
 }
 
 impl Rate {
-    fn new(frames_per_second: u32, now: Instant) -> Self {
-        let interval = Duration::from_secs(1) / frames_per_second;
+    fn new(per_second: u32, now: Instant) -> Self {
+        let interval = Duration::from_secs(1) / per_second;
         let burst = (interval * 2).max(Duration::from_millis(100));
-        Self { interval, burst, due: now.checked_sub(burst).unwrap_or(now), has_told: false }
+        Self { interval, burst, due: now.checked_sub(burst).unwrap_or(now) }
     }
 
-    /// Counts a frame; gives the time before which no other shall be read.
+    /// Counts one; gives the time before which no other shall be read.
     fn take(&mut self, now: Instant) -> Option<Instant> {
         let earliest = now.checked_sub(self.burst).unwrap_or(now);
         self.due = self.due.max(earliest) + self.interval;
         (self.due > now).then_some(self.due)
+    }
+
+    /// Counts one where the rate allows it now.
+    fn take_if_free(&mut self, now: Instant) -> bool {
+        let is_free = self.due <= now;
+        if is_free {
+            self.take(now);
+        }
+        is_free
     }
 }
 
@@ -338,5 +369,23 @@ mod tests {
         for i in 0..200u32 {
             assert_eq!(rate.take(now + Duration::from_millis(500) + Duration::from_millis(10) * i), None);
         }
+    }
+
+    #[test]
+    fn what_is_refused_does_not_count_against_the_rate() {
+        let start = Instant::now() + Duration::from_secs(10);
+        let mut rate = Rate::new(2, start);
+        // A flood every 10 ms for ten seconds: two a second get through, and the burst.
+        let free = (0..1000).filter(|i| rate.take_if_free(start + Duration::from_millis(10) * *i)).count();
+        assert!((20..=23).contains(&free), "{free}");
+    }
+
+    #[tokio::test]
+    async fn silence_counts_from_what_was_heard_last() {
+        let heard = Heard::now();
+        let start = Instant::now();
+        heard.set(start + Duration::from_millis(100));
+        heard.silence(Duration::from_millis(50)).await;
+        assert!(start.elapsed() >= Duration::from_millis(150));
     }
 }

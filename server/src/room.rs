@@ -148,8 +148,9 @@ impl Rooms {
         Ok(Viewing { slot: room.slot.subscribe(), room })
     }
 
-    /// Enters a room as its publisher, in place of another one where `takeover` says so.
-    pub fn claim(&self, name: &RoomName, source: &str, takeover: bool) -> Result<Publishing, RoomError> {
+    /// Enters a room as its publisher, in place of another one where `takeover` says so. What comes with the place says when
+    /// another takes it.
+    pub fn claim(&self, name: &RoomName, source: &str, takeover: bool) -> Result<(Publishing, Evicted), RoomError> {
         let mut by_name = lock(&self.by_name);
         let room = self.find_or_make(&mut by_name, name)?;
         let mut state = lock(&room.state);
@@ -167,7 +168,7 @@ impl Rooms {
         } else {
             self.metrics.publishers.inc();
         }
-        Ok(Publishing { room, session, evicted })
+        Ok((Publishing { room, session }, evicted))
     }
 
     fn find_or_make(&self, by_name: &mut BTreeMap<RoomName, Arc<Room>>, name: &RoomName) -> Result<Arc<Room>, RoomError> {
@@ -250,9 +251,10 @@ pub(crate) struct Publishing {
     pub room: Arc<Room>,
     /// Number of this session in its room, from 1.
     pub session: u32,
-    /// Says that another publisher has taken the place.
-    pub evicted: oneshot::Receiver<()>,
 }
+
+/// Done when another publisher has taken the place.
+pub(crate) type Evicted = oneshot::Receiver<()>;
 
 impl Publishing {
     /// Makes `packet` the room's newest state. False where another publisher has the room.
@@ -302,15 +304,15 @@ mod tests {
     #[test]
     fn a_room_has_one_publisher_and_takeover_replaces_it() {
         let rooms = rooms(10, 10);
-        let mut first = rooms.claim(&name("a"), "one", false).unwrap();
+        let (first, mut evicted) = rooms.claim(&name("a"), "one", false).unwrap();
         assert_eq!(rooms.claim(&name("a"), "two", false).err(), Some(RoomError::Taken));
-        let second = rooms.claim(&name("a"), "two", true).unwrap();
+        let (second, _evicted) = rooms.claim(&name("a"), "two", true).unwrap();
         assert_eq!((first.session, second.session), (1, 2));
-        assert_eq!(first.evicted.try_recv(), Ok(()));
+        assert_eq!(evicted.try_recv(), Ok(()));
         drop(first);
         assert_eq!(rooms.claim(&name("a"), "three", false).err(), Some(RoomError::Taken), "the old one's end frees nothing");
         drop(second);
-        assert_eq!(rooms.claim(&name("a"), "three", false).unwrap().session, 3);
+        assert_eq!(rooms.claim(&name("a"), "three", false).unwrap().0.session, 3);
         assert_eq!(rooms.metrics.publishers.get(), 0);
     }
 

@@ -1,25 +1,30 @@
 //! `send`: publishes a feed in real time or as fast as the server takes it.
 
 use crate::feed::{Feed, FeedError, FeedItem};
-use futures_util::stream::SplitStream;
+use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use indicatif::ProgressBar;
 use rhytid_shared::TrackingFrame;
+use rhytid_shared::view::SUBPROTOCOL;
 use serde::Deserialize;
+use std::future::Future;
 use std::io::{BufRead, BufReader, Cursor};
 use std::path::PathBuf;
+use std::pin::Pin;
 use std::time::Duration;
 use tokio::net::TcpStream;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::http::{HeaderValue, header};
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::{self, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
 
-/// How long the server may take to say that it is ready.
-const READY_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long the server may take to read what is on its way and to close.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(120);
+/// How long it may take to close when the sender is stopped.
+const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Why a feed could not be sent.
 #[derive(Debug, thiserror::Error)]
@@ -67,6 +72,8 @@ pub struct SendOptions {
     pub repeats: bool,
     /// Take the room over from another publisher.
     pub takeover: bool,
+    /// How long the server may take to accept the connection, to answer the hello, and to read a message.
+    pub timeout: Duration,
 }
 
 /// What was sent.
@@ -78,29 +85,39 @@ pub struct SendReport {
     pub errors: u64,
 }
 
-/// Sends a feed; `progress` counts its bytes and shows what the server answers.
-pub async fn send(options: &SendOptions, progress: &ProgressBar) -> Result<SendReport, SendError> {
+/// Sends a feed until its end, or until `stop` is done; `progress` counts its bytes and shows what the server answers.
+pub async fn send(options: &SendOptions, progress: &ProgressBar, stop: impl Future<Output = ()>) -> Result<SendReport, SendError> {
     let mut report = SendReport::default();
+    tokio::pin!(stop);
     loop {
         progress.set_position(0);
-        match &options.source {
+        let ending = match &options.source {
             SendSource::File(path) => {
                 if let Ok(file) = std::fs::metadata(path) {
                     progress.set_length(file.len());
                 }
                 let feed: Feed<BufReader<std::fs::File>> = Feed::open_for_any_character(path)?;
-                send_once(feed, options, progress, &mut report).await?;
+                send_once(feed, options, progress, &mut report, stop.as_mut()).await?
             }
             SendSource::Text(text, name) => {
                 progress.set_length(text.len() as u64);
                 let feed = Feed::new_for_any_character(Cursor::new(text.as_bytes()), name.clone())?;
-                send_once(feed, options, progress, &mut report).await?;
+                send_once(feed, options, progress, &mut report, stop.as_mut()).await?
             }
-        }
-        if !options.repeats {
+        };
+        if ending == Ending::Stopped || !options.repeats {
             return Ok(report);
         }
     }
+}
+
+/// Why a session was closed without an error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Ending {
+    /// The whole feed has been sent.
+    Sent,
+    /// The sender was told to stop.
+    Stopped,
 }
 
 /// What a server says to a publisher.
@@ -121,66 +138,127 @@ enum Answer {
     Unknown,
 }
 
-type Answers = SplitStream<WebSocketStream<MaybeTlsStream<TcpStream>>>;
+type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
+type Sink = SplitSink<Socket, Message>;
+type Answers = SplitStream<Socket>;
 
 async fn send_once<R: BufRead>(
     mut feed: Feed<R>,
     options: &SendOptions,
     progress: &ProgressBar,
     report: &mut SendReport,
-) -> Result<(), SendError> {
-    let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
-    let (socket, _) = connect_async(&url).await.map_err(|error| SendError::Connect { url, problem: explain(error) })?;
-    let (mut sink, answers) = socket.split();
-    let (ready, mut is_ready) = oneshot::channel();
+    mut stop: Pin<&mut impl Future<Output = ()>>,
+) -> Result<Ending, SendError> {
+    let connected = tokio::select! {
+        () = stop.as_mut() => return Ok(Ending::Stopped),
+        connected = connect(options) => connected?,
+    };
+    let (mut sink, answers) = connected.split();
+    let (ready, is_ready) = oneshot::channel();
     // Answers are read beside the sending: a server whose answers nobody reads stops reading, too.
     let mut listening = tokio::spawn(listen(answers, progress.clone(), ready));
     let ended = |end: Result<End, tokio::task::JoinError>| SendError::Ended {
         reason: end.map_or_else(|error| error.to_string(), |end| end.reason),
     };
 
-    if sink.send(Message::text(hello(feed.text(), options.takeover))).await.is_err() {
-        return Err(ended(listening.await));
-    }
-    tokio::select! {
-        // An end of the listening says more than that it will not be ready.
+    let ending = tokio::select! {
+        // An end of the listening says more than that a message did not get through.
         biased;
         end = &mut listening => return Err(ended(end)),
-        ready = tokio::time::timeout(READY_TIMEOUT, &mut is_ready) => if ready.is_err() {
-            return Err(SendError::Ended { reason: format!("no answer to the hello within {} s", READY_TIMEOUT.as_secs()) });
+        () = stop.as_mut() => Ending::Stopped,
+        sent = publish(&mut feed, &mut sink, is_ready, options, progress, report) => match sent {
+            Ok(()) => Ending::Sent,
+            Err(Unsent::Feed(error)) => return Err(error.into()),
+            Err(Unsent::Lost) => return Err(match tokio::time::timeout(options.timeout, listening).await {
+                Ok(end) => ended(end),
+                Err(_) => SendError::Ended { reason: "the connection broke off".into() },
+            }),
+            Err(Unsent::Stuck(reason)) => return Err(SendError::Ended { reason }),
         },
+    };
+    // A server that has ended the session in this moment says so in its own close; one that reads nothing is cut off below.
+    let closing = async {
+        let _ = sink.send(Message::Close(None)).await;
+        (&mut listening).await
+    };
+    let patience = if ending == Ending::Stopped { STOP_TIMEOUT } else { CLOSE_TIMEOUT };
+    let end = tokio::select! {
+        end = tokio::time::timeout(patience, closing) => end,
+        () = stop, if ending == Ending::Sent => return Ok(Ending::Stopped),
+    };
+    match end {
+        Ok(Ok(End { is_normal: true, errors, .. })) => {
+            report.errors += errors;
+            Ok(ending)
+        }
+        Err(_) if ending == Ending::Stopped => Ok(ending),
+        Ok(end) => Err(ended(end)),
+        Err(_) => Err(SendError::Ended { reason: "it does not answer the close".into() }),
     }
+}
 
+/// Connects to the room's publish socket.
+async fn connect(options: &SendOptions) -> Result<Socket, SendError> {
+    let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
+    let connecting = async {
+        let mut request = url.as_str().into_client_request()?;
+        request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
+        connect_async(request).await
+    };
+    let problem = match tokio::time::timeout(options.timeout, connecting).await {
+        Ok(Ok((socket, _))) => return Ok(socket),
+        Ok(Err(error)) => explain(error),
+        Err(_) => format!("no answer within {} s", options.timeout.as_secs_f64()),
+    };
+    Err(SendError::Connect { url, problem })
+}
+
+/// Why a feed did not get through.
+enum Unsent {
+    /// The feed is broken.
+    Feed(FeedError),
+    /// The connection is.
+    Lost,
+    /// The server does not answer, or does not read.
+    Stuck(String),
+}
+
+/// Sends the hello and, once the server is ready, the feed in its time.
+async fn publish<R: BufRead>(
+    feed: &mut Feed<R>,
+    sink: &mut Sink,
+    is_ready: oneshot::Receiver<()>,
+    options: &SendOptions,
+    progress: &ProgressBar,
+    report: &mut SendReport,
+) -> Result<(), Unsent> {
+    let within = |what: &str| Unsent::Stuck(format!("{what} within {} s", options.timeout.as_secs_f64()));
+    let mut write = async |text: String| match tokio::time::timeout(options.timeout, sink.send(Message::text(text))).await {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(_)) => Err(Unsent::Lost),
+        Err(_) => Err(within("it read nothing")),
+    };
+    write(hello(feed.text(), options.takeover)).await?;
+    // An error means that the listening has ended, which is told there.
+    if tokio::time::timeout(options.timeout, is_ready).await.map_err(|_| within("no answer to the hello"))?.is_err() {
+        return Err(Unsent::Lost);
+    }
     let mut frame = TrackingFrame::default();
     let mut clock: Option<(Instant, f64)> = None;
-    while let Some(item) = feed.next_frame(&mut frame)? {
+    while let Some(item) = feed.next_frame(&mut frame).map_err(Unsent::Feed)? {
         if item == FeedItem::Frame {
             let (start, t0) = *clock.get_or_insert_with(|| (Instant::now(), frame.t));
             // At infinite speed every frame is due at once.
             let due = start + Duration::from_secs_f64(((frame.t - t0) / options.speed).clamp(0.0, 1e9));
             if due > Instant::now() {
-                tokio::select! {
-                    end = &mut listening => return Err(ended(end)),
-                    () = tokio::time::sleep_until(due) => {}
-                }
+                tokio::time::sleep_until(due).await;
             }
             report.frames += 1;
         }
-        if sink.send(Message::text(feed.text())).await.is_err() {
-            return Err(ended(listening.await));
-        }
+        write(feed.text().to_owned()).await?;
         progress.inc(feed.text().len() as u64 + 1);
     }
-    // A server that has ended the session in this moment says so in its own close.
-    let _ = sink.send(Message::Close(None)).await;
-    match tokio::time::timeout(CLOSE_TIMEOUT, listening).await {
-        Ok(Ok(End { is_normal: true, errors, .. })) => {
-            report.errors += errors;
-            Ok(())
-        }
-        Ok(end) => Err(ended(end)),
-        Err(_) => Err(SendError::Ended { reason: "it does not answer the close".into() }),
-    }
+    Ok(())
 }
 
 /// How a session came to its end.

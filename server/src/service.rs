@@ -1,9 +1,11 @@
 //! The service as a whole: connections in, tasks out, and an orderly end.
 
-use crate::config::{ServerConfig, ServerConfigError, seconds};
+use crate::config::{Limits, ServerConfig, ServerConfigError, seconds};
 use crate::http::router;
 use crate::metrics::Metrics;
 use crate::room::Rooms;
+use crate::socket::{ErrorMessage, say_and_close};
+use crate::stream::TimedStream;
 use axum::extract::Request;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use rhytid_shared::packet::PacketLayout;
@@ -12,11 +14,11 @@ use rhytid_shared::{Character, CharacterError, DEFAULT_CHARACTER_GLB};
 use std::collections::HashMap;
 use std::convert::Infallible;
 use std::future::Future;
-use std::net::{IpAddr, SocketAddr};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{Semaphore, mpsc, watch};
 use tokio_tungstenite::tungstenite::Bytes;
 use tower_service::Service as _;
 
@@ -28,6 +30,8 @@ const SWEEP_INTERVAL: Duration = Duration::from_secs(1);
 const UNSENT_BYTES: u32 = 4096;
 /// Largest head of a request, and hyper's smallest buffer.
 const MAX_REQUEST_HEAD: usize = 16 << 10;
+/// Connections over a limit that are told so at a time; in a flood the rest are cut without a word.
+const MOST_REFUSALS: usize = 64;
 /// A pause where the process has no file descriptor left.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
@@ -83,7 +87,8 @@ pub(crate) struct Hub {
     pub shutdown: watch::Receiver<bool>,
     /// Every task holds the hub, so this is dropped with the last of them, for which the service waits.
     _tasks: mpsc::Sender<Infallible>,
-    connections: Mutex<HashMap<IpAddr, usize>>,
+    connections: Mutex<Connections>,
+    refusals: Arc<Semaphore>,
 }
 
 /// Done when the service ends.
@@ -111,11 +116,16 @@ pub async fn bind(address: &str) -> Result<TcpListener, ServerError> {
     TcpListener::bind(address).await.map_err(|source| ServerError::Listen { address: address.to_owned(), source })
 }
 
-/// Serves on `listener` until `shutdown` is done, then closes every socket with a reason.
-pub async fn run(listener: TcpListener, config: ServerConfig, shutdown: impl Future<Output = ()>) -> Result<(), ServerError> {
+/// Serves a character, with the `.glb` it was read from, on `listener` until `shutdown` is done, then closes every socket with
+/// a reason.
+pub async fn run(
+    listener: TcpListener,
+    config: ServerConfig,
+    (character, glb): (Arc<Character>, Vec<u8>),
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), ServerError> {
     config.validate()?;
     let address = listener.local_addr().map_err(|source| ServerError::Listen { address: config.listen.clone(), source })?;
-    let (character, glb) = load_character(config.character.as_deref())?;
     let metrics = Arc::new(Metrics::new());
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
@@ -132,6 +142,7 @@ pub async fn run(listener: TcpListener, config: ServerConfig, shutdown: impl Fut
         shutdown: stops,
         _tasks: tasks,
         connections: Mutex::default(),
+        refusals: Arc::new(Semaphore::new(MOST_REFUSALS)),
         config,
     });
     let app = router(hub.clone());
@@ -162,13 +173,13 @@ pub async fn run(listener: TcpListener, config: ServerConfig, shutdown: impl Fut
     Ok(())
 }
 
-/// Serves one connection in a task of its own, unless its address has too many.
+/// Serves one connection in a task of its own, unless there are too many.
 fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Router) {
-    let Some(place) = Place::take(hub, peer.ip().to_canonical()) else {
-        hub.metrics.end("too_many_connections");
-        return tracing::debug!(%peer, "too many connections from this address");
-    };
     prepare(&stream);
+    let place = match Place::take(hub, peer.ip()) {
+        Ok(place) => place,
+        Err(error) => return refuse(hub, stream, peer, &error),
+    };
     let (hub, app) = (hub.clone(), app.clone());
     tokio::spawn(async move {
         let place = Arc::new(place);
@@ -183,7 +194,7 @@ fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Route
             .timer(TokioTimer::new())
             .header_read_timeout(seconds(hub.config.timeouts.hello))
             .max_buf_size(MAX_REQUEST_HEAD)
-            .serve_connection(TokioIo::new(stream), service)
+            .serve_connection(TokioIo::new(TimedStream::new(stream, seconds(hub.config.timeouts.write))), service)
             .with_upgrades();
         tokio::pin!(connection);
         let mut shutdown = hub.shutdown.clone();
@@ -197,6 +208,22 @@ fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Route
         if let Err(error) = result {
             tracing::debug!(%peer, %error, "connection ended");
         }
+    });
+}
+
+/// Tells a connection that there are too many, in a task of its own where there is room for one.
+fn refuse(hub: &Hub, stream: TcpStream, peer: SocketAddr, error: &ErrorMessage) {
+    hub.metrics.end(error.code);
+    tracing::debug!(%peer, message = error.message, "connection refused");
+    let Ok(permit) = hub.refusals.clone().try_acquire_owned() else { return };
+    let body = serde_json::to_string(error).expect("plain data can be written");
+    let answer = format!(
+        "HTTP/1.1 503 Service Unavailable\r\nContent-Type: application/json\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{body}",
+        body.len()
+    );
+    tokio::spawn(async move {
+        say_and_close(stream, answer.as_bytes()).await;
+        drop(permit);
     });
 }
 
@@ -216,38 +243,82 @@ fn prepare(stream: &TcpStream) {
     }
 }
 
-/// A connection's place among those of its address; given back on drop.
+/// Connections at a time, altogether and by address.
+#[derive(Debug, Default)]
+struct Connections {
+    total: usize,
+    by_address: HashMap<IpAddr, usize>,
+}
+
+impl Connections {
+    /// Counts one more of `address`, unless that is too many.
+    fn take(&mut self, address: Option<IpAddr>, limits: &Limits) -> Result<(), ErrorMessage> {
+        let refuse = |who: &str, most: usize| {
+            Err(ErrorMessage::new("too_many_connections", format!("{who} has {most} connections already, which is its limit")))
+        };
+        if self.total >= limits.connections {
+            return refuse("the server", limits.connections);
+        }
+        if let Some(address) = address {
+            let count = self.by_address.entry(address).or_default();
+            if *count >= limits.connections_per_address {
+                return refuse("this address", limits.connections_per_address);
+            }
+            *count += 1;
+        }
+        self.total += 1;
+        Ok(())
+    }
+
+    fn give_back(&mut self, address: Option<IpAddr>) {
+        self.total -= 1;
+        if let Some(address) = address
+            && let Some(count) = self.by_address.get_mut(&address)
+        {
+            *count -= 1;
+            if *count == 0 {
+                self.by_address.remove(&address);
+            }
+        }
+    }
+}
+
+/// The address that a connection counts for. Loopback counts for none; a host with IPv6 has a whole /64 to itself, from which it
+/// may take an address for each connection (RFC 4291, 2.5.4).
+fn counted_as(address: IpAddr) -> Option<IpAddr> {
+    match address.to_canonical() {
+        address if address.is_loopback() => None,
+        IpAddr::V6(address) => Some(Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)).into()),
+        address => Some(address),
+    }
+}
+
+/// A connection's place among all; given back on drop.
 pub(crate) struct Place {
     hub: Arc<Hub>,
-    /// `None` for loopback, whose connections are not counted.
     address: Option<IpAddr>,
 }
 
 impl Place {
-    fn take(hub: &Arc<Hub>, address: IpAddr) -> Option<Self> {
-        if address.is_loopback() {
-            return Some(Self { hub: hub.clone(), address: None });
-        }
-        let mut connections = hub.connections.lock().unwrap_or_else(PoisonError::into_inner);
-        let count = connections.entry(address).or_default();
-        if *count >= hub.config.limits.connections_per_address {
-            return None;
-        }
-        *count += 1;
-        Some(Self { hub: hub.clone(), address: Some(address) })
+    fn take(hub: &Arc<Hub>, address: IpAddr) -> Result<Self, ErrorMessage> {
+        let address = counted_as(address);
+        hub.connections().take(address, &hub.config.limits)?;
+        hub.metrics.connections.inc();
+        Ok(Self { hub: hub.clone(), address })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        let Some(address) = self.address else { return };
-        let mut connections = self.hub.connections.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(count) = connections.get_mut(&address) {
-            *count -= 1;
-            if *count == 0 {
-                connections.remove(&address);
-            }
-        }
+        self.hub.connections().give_back(self.address);
+        self.hub.metrics.connections.dec();
+    }
+}
+
+impl Hub {
+    fn connections(&self) -> MutexGuard<'_, Connections> {
+        // Counts are whole at each step, also where a holder has panicked.
+        self.connections.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -256,4 +327,40 @@ fn file_name(name: &str) -> String {
     let name: String = name.chars().take(64).map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' }).collect();
     let name = name.trim_matches('-');
     if name.is_empty() { "character".to_owned() } else { name.to_owned() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn connections_are_limited_altogether_and_by_address() {
+        let limits = Limits { connections: 4, connections_per_address: 2, ..Limits::default() };
+        let mut connections = Connections::default();
+        let of = |text: &str| counted_as(text.parse().unwrap());
+        let mut take = |text: &str| connections.take(of(text), &limits).map_err(|error| error.message);
+        let full = Err("this address has 2 connections already, which is its limit".to_owned());
+        assert_eq!(take("192.0.2.1"), Ok(()));
+        assert_eq!(take("::ffff:192.0.2.1"), Ok(()), "IPv4 in IPv6's clothes");
+        assert_eq!(take("192.0.2.1"), full);
+        assert_eq!(take("2001:db8::1"), Ok(()));
+        assert_eq!(take("2001:db8::ffff:2"), Ok(()));
+        assert_eq!(take("192.0.2.7"), Err("the server has 4 connections already, which is its limit".to_owned()));
+        connections.give_back(of("192.0.2.1"));
+        let mut take = |text: &str| connections.take(of(text), &limits).map_err(|error| error.message);
+        assert_eq!(take("2001:db8::3"), full, "one /64 is one host");
+        assert_eq!(take("2001:db8:0:1::1"), Ok(()));
+        connections.give_back(of("192.0.2.1"));
+        assert!(!connections.by_address.contains_key(&of("192.0.2.1").unwrap()), "nothing is kept of who has gone");
+    }
+
+    #[test]
+    fn loopback_counts_for_no_address() {
+        let limits = Limits { connections: 3, connections_per_address: 1, ..Limits::default() };
+        let mut connections = Connections::default();
+        for address in ["127.0.0.1", "127.0.0.1", "::1"] {
+            connections.take(counted_as(address.parse().unwrap()), &limits).unwrap();
+        }
+        assert!(connections.take(None, &limits).is_err(), "but altogether");
+    }
 }

@@ -1,6 +1,8 @@
 //! WebSockets below the messages: the upgrade with its checks, small buffers, and closing so that the last word arrives.
 
-use crate::service::Place;
+use crate::metrics::Metrics;
+use crate::service::{Hub, Place, stopped};
+use crate::stream::TimedStream;
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -12,8 +14,10 @@ use serde::Serialize;
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::protocol::{CloseFrame, Role, WebSocketConfig};
@@ -24,6 +28,10 @@ pub(crate) type Socket = WebSocketStream<TcpStream>;
 
 /// How long a peer may take to answer a close before its connection is cut.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Bytes that are read and thrown away after the last word: the largest message a configuration may allow. A peer that has
+/// more to say loses the last word.
+const MOST_DRAINED: usize = 16 << 20;
 
 /// How long the first frames, a few KB, may take to get into a fresh socket.
 const FIRST_WRITE_TIMEOUT: Duration = Duration::from_secs(10);
@@ -81,43 +89,72 @@ impl From<Ending> for Stop {
     }
 }
 
-/// Checks a request for a WebSocket, answers it and runs `talk` on the socket in a task of its own.
-pub(crate) fn upgrade<F, Fut>(mut request: Request, config: WebSocketConfig, first: Vec<u8>, talk: F) -> Response
+/// A request for a WebSocket that has been checked.
+pub(crate) struct Handshake {
+    accept: HeaderValue,
+    /// The peer offers subprotocols, ours among them.
+    offers_protocol: bool,
+}
+
+impl Handshake {
+    /// Checks `request`; the answer that refuses it where it is no handshake, or one for another protocol.
+    pub fn check(request: &Request) -> Result<Self, Box<Response>> {
+        let headers = request.headers();
+        let has_token = |name, token: &str| tokens(headers, &name).any(|given| given.eq_ignore_ascii_case(token));
+        let version_is_13 = headers.get(header::SEC_WEBSOCKET_VERSION).is_some_and(|version| version == "13");
+        let (true, true, true, Some(key)) = (
+            has_token(header::CONNECTION, "upgrade"),
+            has_token(header::UPGRADE, "websocket"),
+            version_is_13,
+            headers.get(header::SEC_WEBSOCKET_KEY),
+        ) else {
+            let mut answer =
+                ErrorMessage::new("not_a_websocket", "expected a WebSocket handshake, version 13").response(StatusCode::UPGRADE_REQUIRED);
+            answer.headers_mut().insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
+            return Err(answer.into());
+        };
+        let mut offered = tokens(headers, &header::SEC_WEBSOCKET_PROTOCOL).peekable();
+        let offers_protocol = offered.peek().is_some();
+        if offers_protocol && !offered.any(|protocol| protocol == SUBPROTOCOL) {
+            let message = format!("none of the subprotocols offered is known, expected {SUBPROTOCOL} or none at all");
+            return Err(ErrorMessage::new("unknown_subprotocol", message).response(StatusCode::BAD_REQUEST).into());
+        }
+        let accept = HeaderValue::from_str(&derive_accept_key(key.as_bytes())).expect("base64 is a header value");
+        Ok(Self { accept, offers_protocol })
+    }
+}
+
+/// Answers a handshake, writes the `first` frames and runs `talk` on the socket in a task of its own.
+pub(crate) fn upgrade<F, Fut>(
+    hub: &Hub,
+    mut request: Request,
+    handshake: Handshake,
+    config: WebSocketConfig,
+    first: Vec<u8>,
+    talk: F,
+) -> Response
 where
     F: FnOnce(Socket) -> Fut + Send + 'static,
     Fut: Future<Output = ()> + Send,
 {
-    let headers = request.headers();
-    let has_token = |name, token: &str| tokens(headers, &name).any(|given| given.eq_ignore_ascii_case(token));
-    let version_is_13 = headers.get(header::SEC_WEBSOCKET_VERSION).is_some_and(|version| version == "13");
-    let key = headers.get(header::SEC_WEBSOCKET_KEY).cloned();
-    let (true, true, true, Some(key)) =
-        (has_token(header::CONNECTION, "upgrade"), has_token(header::UPGRADE, "websocket"), version_is_13, key)
-    else {
-        let mut answer =
-            ErrorMessage::new("not_a_websocket", "expected a WebSocket handshake, version 13").response(StatusCode::UPGRADE_REQUIRED);
-        answer.headers_mut().insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
-        return answer;
-    };
-    let mut offered = tokens(headers, &header::SEC_WEBSOCKET_PROTOCOL).peekable();
-    let offers_some = offered.peek().is_some();
-    if offers_some && !offered.any(|protocol| protocol == SUBPROTOCOL) {
-        let message = format!("none of the subprotocols offered is known, expected {SUBPROTOCOL} or none at all");
-        return ErrorMessage::new("unknown_subprotocol", message).response(StatusCode::BAD_REQUEST);
-    }
-    drop(offered);
+    let mut shutdown = hub.shutdown.clone();
     let upgraded = hyper::upgrade::on(&mut request);
     let place = request.extensions().get::<Arc<Place>>().cloned();
     tokio::spawn(async move {
-        let parts = match upgraded.await.map(hyper::upgrade::Upgraded::downcast::<TokioIo<TcpStream>>) {
+        let parts = match upgraded.await.map(hyper::upgrade::Upgraded::downcast::<TokioIo<TimedStream>>) {
             Ok(Ok(parts)) => parts,
             Ok(Err(_)) => return tracing::error!("an upgraded connection is not the TCP stream it was"),
             Err(error) => return tracing::debug!(%error, "the upgrade did not happen"),
         };
-        let mut stream = parts.io.into_inner();
+        let mut stream = parts.io.into_inner().into_inner();
         // The first frames go around the WebSocket's write buffer, which would keep their size for as long as it lives.
-        let written = tokio::time::timeout(FIRST_WRITE_TIMEOUT, tokio::io::AsyncWriteExt::write_all(&mut stream, &first)).await;
-        if !matches!(written, Ok(Ok(()))) {
+        let is_written = tokio::select! {
+            biased;
+            written = tokio::time::timeout(FIRST_WRITE_TIMEOUT, stream.write_all(&first)) => matches!(written, Ok(Ok(()))),
+            // A socket that does not take its first frames cannot be told of the end either.
+            () = stopped(&mut shutdown) => false,
+        };
+        if !is_written {
             return;
         }
         drop(first);
@@ -126,11 +163,10 @@ where
     });
     let mut answer = Response::new(Body::empty());
     *answer.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
-    let accept = HeaderValue::from_str(&derive_accept_key(key.as_bytes())).expect("base64 is a header value");
-    answer.headers_mut().insert(header::SEC_WEBSOCKET_ACCEPT, accept);
+    answer.headers_mut().insert(header::SEC_WEBSOCKET_ACCEPT, handshake.accept);
     answer.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("upgrade"));
     answer.headers_mut().insert(header::UPGRADE, HeaderValue::from_static("websocket"));
-    if offers_some {
+    if handshake.offers_protocol {
         answer.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
     }
     answer
@@ -181,6 +217,35 @@ pub(crate) async fn send_json(socket: &mut Socket, value: &impl Serialize, timeo
     send(socket, Message::text(text), timeout).await
 }
 
+/// What a broken stream of messages, of at most `most` bytes each, means for its sender.
+pub(crate) fn broken(error: Error, most: usize) -> Stop {
+    match error {
+        Error::Capacity(CapacityError::MessageTooLong { size, .. }) => {
+            let message = format!("message has {size} bytes or more, at most {most} are allowed");
+            Ending::error(CloseCode::Size, ErrorMessage::new("too_long", message)).into()
+        }
+        Error::Utf8(_) => Ending::error(CloseCode::Invalid, ErrorMessage::new("not_utf8", "text message is not UTF-8")).into(),
+        // The connection ended without a close, as when a laptop's lid shuts.
+        Error::Protocol(ProtocolError::ResetWithoutClosingHandshake) => Stop::Gone("connection_lost"),
+        Error::Protocol(error) => Ending::error(CloseCode::Protocol, ErrorMessage::new("protocol", error.to_string())).into(),
+        _ => Stop::Gone("connection_lost"),
+    }
+}
+
+/// Ends a socket as `stop` says, and counts it.
+pub(crate) async fn end(socket: Socket, stop: Stop, metrics: &Metrics) {
+    match stop {
+        Stop::End(ending) => {
+            metrics.end(ending.error.as_ref().map_or("shutdown", |error| error.code));
+            close(socket, &ending).await;
+        }
+        Stop::Gone(reason) => {
+            metrics.end(reason);
+            farewell(socket).await;
+        }
+    }
+}
+
 /// Tells the peer why, closes, and waits a little for its answer: what is unread when a connection is cut would take the
 /// last message with it.
 pub(crate) async fn close(mut socket: Socket, ending: &Ending) {
@@ -207,8 +272,39 @@ pub(crate) async fn close(mut socket: Socket, ending: &Ending) {
 }
 
 /// Reads to the end of a socket that one side has closed, which also sends the answer to a peer's close.
-pub(crate) async fn farewell(mut socket: Socket) {
-    let reading = async { while socket.next().await.is_some_and(|message| message.is_ok()) {} };
+async fn farewell(mut socket: Socket) {
+    let reading = async {
+        while socket.next().await.is_some_and(|message| message.is_ok()) {}
+        // After an error the WebSocket gives nothing more, but its peer may still be writing.
+        drain(&mut socket.into_inner()).await;
+    };
     // A peer that stays silent is cut off.
     let _ = tokio::time::timeout(CLOSE_TIMEOUT, reading).await;
+}
+
+/// Says the last word on a connection that has not become a socket.
+pub(crate) async fn say_and_close(mut stream: TcpStream, bytes: &[u8]) {
+    let saying = async {
+        if stream.write_all(bytes).await.is_ok() {
+            drain(&mut stream).await;
+        }
+    };
+    // A peer that stays is cut off.
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, saying).await;
+}
+
+/// Ends the sending half, then reads what still comes and throws it away, up to [`MOST_DRAINED`] bytes: a connection that is
+/// dropped with unread bytes is reset, and a reset takes the bytes on their way to the peer with it.
+async fn drain(stream: &mut TcpStream) {
+    if stream.shutdown().await.is_err() {
+        return;
+    }
+    let mut buffer = vec![0; 16 << 10];
+    let mut num_left = MOST_DRAINED;
+    while num_left > 0 {
+        match stream.read(&mut buffer).await {
+            Ok(0) | Err(_) => return,
+            Ok(num_bytes) => num_left = num_left.saturating_sub(num_bytes),
+        }
+    }
 }

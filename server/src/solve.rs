@@ -41,14 +41,12 @@ pub use error::SolveError;
 use easing::{Easing, FaceState};
 use evaluate::Evaluator;
 use landmark_session::LandmarkSession;
+use rhytid_shared::limits::MAX_SECONDS;
 use rhytid_shared::{Character, FaceFrame, HeadPose, PublishHello, TrackingData, TrackingFrame};
 use serde::Serialize;
 use skeleton::Skeleton;
 use std::sync::Arc;
 use weight_session::{SentHead, WeightSession};
-
-/// No sender's clock is beyond this, seconds: three hundred years, and microseconds of it still fit an `f64`.
-const LATEST: f64 = 9e9;
 
 /// What a publisher is told when a neutral has been reached.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -193,7 +191,7 @@ impl Solver {
     /// On an error `out` and the session are as before: the frame counts for nothing.
     pub fn solve(&mut self, frame: &TrackingFrame, out: &mut FaceFrame) -> Result<(), SolveError> {
         let t = frame.t;
-        if !(0.0..=LATEST).contains(&t) {
+        if !(0.0..=MAX_SECONDS).contains(&t) {
             return Err(SolveError::TimeRange { got: t });
         }
         if let Some(previous) = self.last_t.filter(|previous| t <= *previous) {

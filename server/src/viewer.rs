@@ -7,7 +7,7 @@
 use crate::config::seconds;
 use crate::room::{Latest, Viewing};
 use crate::service::{Hub, stopped};
-use crate::socket::{Ending, ErrorMessage, Socket, Stop, close, farewell, frame_bytes};
+use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, frame_bytes, send};
 use futures_util::{SinkExt, StreamExt};
 use rhytid_shared::RoomName;
 use rhytid_shared::view::{ViewHello, ViewMessage};
@@ -23,12 +23,16 @@ const PING_SPACING: Duration = Duration::from_millis(120);
 /// For this long packets go out while a ping is unanswered; longer than most round trips, and with [`PING_SPACING`]
 /// shorter than the half second of old packets that a viewer may find when it wakes.
 const WINDOW: Duration = Duration::from_millis(300);
+/// How often a packet goes to a viewer that has not answered a ping yet, once [`WINDOW`] is over. One that never does breaks the
+/// protocol (RFC 6455, 5.5.2): it still shows that something moves, until the idle time-out, and kernels hold little for it.
+const TRICKLE: Duration = Duration::from_secs(1);
+/// Largest message of a viewer, bytes: it has nothing to say but pongs.
+const LARGEST_MESSAGE: usize = 1024;
 
 /// Small buffers: a viewer sends nothing but pongs, and gets less than 100 bytes at a time.
 pub(crate) fn socket_config() -> WebSocketConfig {
     const READ: usize = 256;
     const WRITE: usize = 512;
-    const LARGEST_MESSAGE: usize = 1024;
     WebSocketConfig::default()
         .read_buffer_size(READ)
         .write_buffer_size(WRITE)
@@ -51,25 +55,21 @@ pub(crate) fn first_frames(hub: &Hub, room: &RoomName) -> Vec<u8> {
 
 /// Sends `viewing`'s states until one side ends it.
 pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing, wants_json: bool) {
-    let mut pace = Pace::new(Instant::now());
-    let stop = run(&hub, &mut socket, &mut viewing, wants_json, &mut pace).await;
+    let mut shutdown = hub.shutdown.clone();
+    let stop = tokio::select! {
+        biased;
+        () = stopped(&mut shutdown) => Ending::shutdown().into(),
+        stop = run(&hub, &mut socket, &mut viewing, wants_json) => stop,
+    };
     drop(viewing);
-    match stop {
-        Stop::End(ending) => {
-            hub.metrics.end(ending.error.as_ref().map_or("shutdown", |error| error.code));
-            close(socket, &ending).await;
-        }
-        Stop::Gone(reason) => {
-            hub.metrics.end(reason);
-            farewell(socket).await;
-        }
-    }
+    end(socket, stop, &hub.metrics).await;
 }
 
-async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: bool, pace: &mut Pace) -> Stop {
+/// Sends states until the viewer is gone or does not answer. May be dropped at any await.
+async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: bool) -> Stop {
     let timeouts = &hub.config.timeouts;
     let (idle, ping_interval, write) = (seconds(timeouts.viewer_idle), seconds(timeouts.ping), seconds(timeouts.write));
-    let mut shutdown = hub.shutdown.clone();
+    let mut pace = Pace::new(Instant::now());
     let mut sent = Sent::default();
     // A state that stands there already is news to this viewer.
     viewing.slot.mark_changed();
@@ -79,17 +79,16 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
             let message = format!("no pong for {} seconds", timeouts.viewer_idle);
             return Ending::error(CloseCode::Policy, ErrorMessage::new("idle", message)).into();
         }
-        let wake = pace.next_ping(ping_interval).min(pace.last_heard + idle);
         let has_credit = pace.has_credit(now);
+        let wake = pace.next_wake(ping_interval, now).min(pace.last_heard + idle);
         tokio::select! {
             biased;
-            () = stopped(&mut shutdown) => return Ending::shutdown().into(),
             message = socket.next() => match message {
                 Some(Ok(Message::Pong(_))) => pace.hear(Instant::now()),
                 Some(Ok(Message::Close(_))) | None => return Stop::Gone("closed"),
                 // Viewers have nothing to say yet; what they say is ignored.
                 Some(Ok(_)) => {}
-                Some(Err(_)) => return Stop::Gone("connection_lost"),
+                Some(Err(error)) => return broken(error, LARGEST_MESSAGE),
             },
             changed = viewing.slot.changed(), if has_credit => {
                 if changed.is_err() {
@@ -97,20 +96,20 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
                 }
                 let latest = viewing.slot.borrow_and_update().clone();
                 let Some(latest) = latest else { continue };
-                let with_ping = pace.takes_ping(Instant::now());
-                let sending = send_state(hub, socket, &latest, wants_json, with_ping, &mut sent);
-                tokio::select! {
-                    result = tokio::time::timeout(write, sending) => match result {
-                        Ok(true) => {}
-                        Ok(false) => return Stop::Gone("connection_lost"),
-                        Err(_) => return Stop::Gone("write_timeout"),
-                    },
-                    () = stopped(&mut shutdown) => return Ending::shutdown().into(),
+                let now = Instant::now();
+                pace.last_packet = now;
+                let with_ping = pace.takes_ping(now);
+                match tokio::time::timeout(write, send_state(hub, socket, &latest, wants_json, with_ping, &mut sent)).await {
+                    Ok(true) => {}
+                    Ok(false) => return Stop::Gone("connection_lost"),
+                    Err(_) => return Stop::Gone("write_timeout"),
                 }
             }
             () = tokio::time::sleep_until(wake) => {
-                if pace.takes_ping(Instant::now()) && !matches!(tokio::time::timeout(write, socket.send(Message::Ping(Bytes::new()))).await, Ok(Ok(()))) {
-                    return Stop::Gone("connection_lost");
+                if pace.takes_ping(Instant::now())
+                    && let Err(stop) = send(socket, Message::Ping(Bytes::new()), write).await
+                {
+                    return stop;
                 }
             }
         }
@@ -165,25 +164,26 @@ struct Pace {
     unanswered: Option<Instant>,
     last_ping: Instant,
     last_heard: Instant,
-    /// A viewer that has never answered a ping breaks the protocol (RFC 6455, 5.5.2); it gets packets as fast as its kernel takes them,
-    /// until the idle time-out.
-    answers_pings: bool,
+    last_packet: Instant,
+    /// It has answered a ping; before that it gets a [`TRICKLE`] beyond the window.
+    has_answered: bool,
 }
 
 impl Pace {
     /// The first ping went out with the hello.
     fn new(now: Instant) -> Self {
-        Self { unanswered: Some(now), last_ping: now, last_heard: now, answers_pings: false }
+        Self { unanswered: Some(now), last_ping: now, last_heard: now, last_packet: now, has_answered: false }
     }
 
     fn hear(&mut self, now: Instant) {
         self.unanswered = None;
         self.last_heard = now;
-        self.answers_pings = true;
+        self.has_answered = true;
     }
 
+    /// True where a packet may go out now.
     fn has_credit(&self, now: Instant) -> bool {
-        !self.answers_pings || self.unanswered.is_none_or(|since| now < since + WINDOW)
+        self.unanswered.is_none_or(|since| now < since + WINDOW) || (!self.has_answered && now >= self.last_packet + TRICKLE)
     }
 
     /// True where a ping shall go out now, which is noted.
@@ -196,12 +196,13 @@ impl Pace {
         is_due
     }
 
-    /// When a socket without packets is pinged.
-    fn next_ping(&self, interval: Duration) -> Instant {
+    /// When a socket without packets is looked at again: to be pinged, or for its next packet of the trickle.
+    fn next_wake(&self, interval: Duration, now: Instant) -> Instant {
         match self.unanswered {
+            None => self.last_ping + interval.max(PING_SPACING),
+            Some(_) if !self.has_answered && !self.has_credit(now) => self.last_packet + TRICKLE,
             // Far enough away: the idle time-out comes before.
             Some(since) => since + Duration::from_secs(86_400),
-            None => self.last_ping + interval.max(PING_SPACING),
         }
     }
 }
@@ -230,6 +231,28 @@ mod tests {
         assert!((2200..=2500).contains(&last_sent), "last packet {last_sent} ms after the start");
         pace.hear(at(10_000));
         assert!(pace.has_credit(at(10_000)), "it gets the newest when it wakes");
+    }
+
+    #[test]
+    fn a_viewer_that_never_answers_gets_a_window_and_then_a_trickle() {
+        let start = Instant::now();
+        let at = |millis: u64| start + Duration::from_millis(millis);
+        let mut pace = Pace::new(start);
+        let mut num_sent = 0;
+        for millis in (0..10_000).step_by(40) {
+            if pace.has_credit(at(millis)) {
+                num_sent += 1;
+                pace.last_packet = at(millis);
+                assert!(!pace.takes_ping(at(millis)), "the first ping still counts");
+            } else {
+                let wake = pace.next_wake(Duration::from_secs(5), at(millis));
+                assert!(wake > at(millis) && pace.has_credit(wake), "it wakes when it may send again");
+            }
+        }
+        // Eight frames of 40 ms in the window, then about one a second.
+        assert!((16..=18).contains(&num_sent), "{num_sent} of 250");
+        pace.hear(at(10_000));
+        assert!((10_000..10_300).step_by(40).all(|millis| pace.has_credit(at(millis))), "all of them once it has answered");
     }
 
     #[test]

@@ -119,9 +119,11 @@ fn what_cannot_work_says_so_in_one_line() {
     let error = failure(&["serve", "--character", broken.to_str().unwrap()]);
     assert!(error.contains("broken.glb") && error.contains("not a readable .glb"), "{error}");
     let config = scratch("bad.toml", b"[limits]\nroms = 1\n");
-    let output = run(&["serve", "--config", config.to_str().unwrap()]);
-    let stderr = String::from_utf8(output.stderr).unwrap();
-    assert!(!output.status.success() && stderr.contains("unknown field `roms`"), "{stderr}");
+    let error = failure(&["serve", "--config", config.to_str().unwrap()]);
+    assert!(error.contains("bad.toml, line 2: unknown field `roms`"), "{error}");
+    let config = scratch("broken.toml", b"\nlisten = \"a\nb\"\n");
+    let error = failure(&["serve", "--config", config.to_str().unwrap()]);
+    assert!(error.contains("broken.toml, line 3: "), "{error}");
     assert!(failure(&["serve", "--max-rooms", "0"]).contains("limits.rooms is 0"));
     assert!(failure(&["send", "no/such.jsonl"]).contains("no/such.jsonl"));
     let feed = scratch(
@@ -150,7 +152,88 @@ fn flags_win_over_the_file_and_send_reports() {
     let feed = scratch("three.jsonl", b"{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n{\"type\":\"frame\",\"t\":9,\"weights\":{}}\n{\"type\":\"calibrate\"}\n");
     let output = run(&["send", feed.to_str().unwrap(), "--to", &format!("ws://{}", served.address), "--speed", "max"]);
     let stderr = String::from_utf8(output.stderr).unwrap();
-    assert!(output.status.success() && stderr.contains("sent 2 frames, 0 refused"), "{stderr}");
+    assert!(output.status.success() && stderr.contains("sent 2 frames, none refused"), "{stderr}");
+}
+
+#[test]
+fn refused_frames_make_send_fail_and_say_how_many() {
+    let served = Served::start(&[]);
+    let feed = scratch(
+        "refused.jsonl",
+        b"{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n{\"type\":\"frame\",\"t\":1,\"bones\":{\"tail\":[0,0,0]}}\n",
+    );
+    let output = run(&["send", feed.to_str().unwrap(), "--to", &format!("ws://{}", served.address), "--speed", "max"]);
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success(), "{stderr}");
+    assert_eq!(stderr.lines().last(), Some("error: sent 2 frames, of all messages the server refused 1"), "{stderr}");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_sender_that_is_interrupted_closes_its_session() {
+    let served = Served::start(&[]);
+    let feed = scratch(
+        "slow.jsonl",
+        b"{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n{\"type\":\"frame\",\"t\":9000,\"weights\":{}}\n",
+    );
+    let mut viewer = served.view("demo");
+    let mut sender = Command::new(PROGRAM)
+        .args(["send", feed.to_str().unwrap(), "--to", &format!("ws://{}", served.address)])
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    // Its first frame has come: the next one is due in hours.
+    while !matches!(viewer.read().unwrap(), Message::Binary(_)) {}
+    let pid = rustix::process::Pid::from_raw(sender.id() as i32).expect("not 0");
+    rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
+    assert_eq!(sender.wait().unwrap().code(), Some(0));
+    let mut stream = TcpStream::connect(&served.address).unwrap();
+    std::io::Write::write_all(&mut stream, format!("GET /metrics HTTP/1.0\r\nHost: {}\r\n\r\n", served.address).as_bytes()).unwrap();
+    let mut text = String::new();
+    stream.read_to_string(&mut text).unwrap();
+    assert!(text.contains("rhytid_sessions_ended_total{reason=\"closed\"} 1\n"), "{text}");
+}
+
+#[test]
+fn more_is_logged_with_verbose() {
+    let log = |args: &[&str]| {
+        let mut child = Command::new(PROGRAM)
+            .args(["serve", "--listen", "127.0.0.1:0"])
+            .args(args)
+            .env_remove("RUST_LOG")
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let address = line.trim().strip_prefix("listening on http://").unwrap();
+        let stream = TcpStream::connect(address).unwrap();
+        let (mut viewer, _) = tungstenite::client(format!("ws://{address}/v1/rooms/demo/view"), stream).unwrap();
+        while !matches!(viewer.read().unwrap(), Message::Text(_)) {}
+        child.kill().unwrap();
+        let mut log = String::new();
+        child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+        child.wait().unwrap();
+        log
+    };
+    let (plain, verbose) = (log(&[]), log(&["-v"]));
+    assert!(plain.contains("serving") && !plain.contains("viewer connects"), "{plain}");
+    assert!(verbose.contains("serving") && verbose.contains("viewer connects"), "{verbose}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_closed_standard_output_is_no_end() {
+    // Writing to this device always fails.
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let mut child = Command::new(PROGRAM).args(["serve", "--listen", "127.0.0.1:0"]).stdout(full).stderr(Stdio::piped()).spawn().unwrap();
+    let mut log = BufReader::new(child.stderr.take().unwrap()).lines();
+    let said = log.by_ref().map(|line| line.unwrap()).find(|line| line.contains("cannot write to standard output"));
+    assert!(said.is_some(), "it says so");
+    assert!(log.any(|line| line.unwrap().contains("serving")), "and serves");
+    child.kill().unwrap();
+    child.wait().unwrap();
 }
 
 #[cfg(target_os = "linux")]

@@ -16,8 +16,21 @@ pub const MAX_VERTICES: usize = 400_000;
 pub const MAX_CHARACTER_BYTES: usize = 64 << 20;
 /// Largest side of a character's textures, texels: what WebGL2 guarantees is 2,048, what everything in use has is 4,096.
 pub const MAX_TEXTURE_SIDE: u32 = 4096;
+/// Most vertex indices of a character: an unbroken surface has two triangles a vertex. Parts may share one list of them, so
+/// that the size of the file alone does not bound the sum.
+pub const MAX_INDICES: usize = 6 * MAX_VERTICES;
+/// Largest JSON chunk of a character file, bytes: seven times that of the built-in one. Parsed it takes up to two hundred
+/// times as much memory.
+pub const MAX_CHARACTER_JSON_BYTES: usize = 1 << 20;
+/// Most images in a character file: four for each of a dozen parts, and the wrinkle maps.
+pub const MAX_IMAGES: usize = 64;
+/// Most texels of a character's textures together, each use counted: four of the largest; 350 MB on the GPU with their mips.
+pub const MAX_TEXELS: u64 = 4 * (MAX_TEXTURE_SIDE as u64) * (MAX_TEXTURE_SIDE as u64);
 /// Largest message on a publish socket, bytes: 478 points with z and confidence as JSON take 35 KB.
 pub const MAX_MESSAGE_BYTES: usize = 256 << 10;
+/// Largest time on a sender's clock, seconds: the Unix clock stays below it for two centuries, and microseconds of it
+/// are whole numbers in an `f64`.
+pub const MAX_SECONDS: f64 = 9e9;
 /// How far an evaluated point may travel from rest, metres: the range of a packet's 12-bit positions (25 µm a step).
 pub const MAX_BONE_TRAVEL: f32 = 0.0511875;
 /// How far the head may travel from its neutral place, metres.

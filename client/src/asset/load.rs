@@ -21,14 +21,11 @@ pub(super) fn load(bytes: &[u8]) -> Result<CharacterAsset> {
     let gltf = gltf::Gltf::from_slice(bytes).map_err(|error| CharacterError::Glb(error.to_string()))?;
     let blob = gltf.blob.as_deref().unwrap_or_default();
     let (palette, entry_of_joint) = build_palette(&gltf.document, &character);
-    let mut images = Images { document: &gltf.document, blob, decoded: BTreeMap::new() };
+    let mut images = Images { document: &gltf.document, blob, last: None };
 
     let mut primitives = Vec::new();
     for mesh in gltf.document.meshes() {
         for primitive in mesh.primitives() {
-            if primitive.mode() != gltf::mesh::Mode::Triangles {
-                return Err(AssetError::NotTriangles { mesh: mesh.index(), primitive: primitive.index(), mode: primitive.mode() });
-            }
             let (vertices, indices) = read_triangles(&primitive, blob, &entry_of_joint);
             let material = primitive.material();
             let name = material.name().unwrap_or_default().to_owned();
@@ -199,24 +196,26 @@ fn vertex_tangents(positions: &[Vec3], normals: &[Vec3], uvs: &[Vec2], indices: 
         .collect()
 }
 
-/// Decodes each image of the file once.
+/// Decodes the file's images one after another. Only the last is kept: all of them together may take a gigabyte, and what
+/// uses one twice uses it twice in a row.
 struct Images<'a> {
     document: &'a gltf::Document,
     blob: &'a [u8],
-    decoded: BTreeMap<usize, RgbaImage>,
+    last: Option<(usize, RgbaImage)>,
 }
 
 impl Images<'_> {
     fn of_texture(&mut self, texture: usize) -> Result<Option<&RgbaImage>> {
         let Some(texture) = self.document.textures().nth(texture) else { return Ok(None) };
         let index = texture.source().index();
-        if let std::collections::btree_map::Entry::Vacant(entry) = self.decoded.entry(index) {
+        if self.last.as_ref().is_none_or(|(last, _)| *last != index) {
             let gltf::image::Source::View { view, .. } = texture.source().source() else { return Ok(None) };
+            self.last = None;
             let bytes = self.blob.get(view.offset()..view.offset() + view.length()).unwrap_or_default();
             let image = image::load_from_memory(bytes).map_err(|source| AssetError::Image { index, source })?;
-            entry.insert(image.into_rgba8());
+            self.last = Some((index, image.into_rgba8()));
         }
-        Ok(self.decoded.get(&index))
+        Ok(self.last.as_ref().map(|(_, image)| image))
     }
 }
 

@@ -83,7 +83,7 @@ fn halve(from: &[u8], [width, height]: [u32; 2], [to_width, to_height]: [u32; 2]
                 Texels::Slopes | Texels::Linear2 => {
                     for channel in 0..2 {
                         let sum: u32 = four.iter().map(|texel| u32::from(texel[channel])).sum();
-                        to.push(((sum + 2) / 4) as u8);
+                        to.push(quarter(sum));
                     }
                 }
                 Texels::AlbedoSrgb => {
@@ -103,6 +103,13 @@ fn halve(from: &[u8], [width, height]: [u32; 2], [to_width, to_height]: [u32; 2]
         }
     }
     to
+}
+
+/// A fourth of the sum of four codes. Halves go to the even code: always up would tilt a surface by an eighth of a code a
+/// level, and as code 128 is even and flat, opposite slopes stay opposite.
+fn quarter(sum: u32) -> u8 {
+    let (down, left_over) = (sum / 4, sum % 4);
+    (down + u32::from(left_over == 3 || (left_over == 2 && down % 2 == 1))) as u8
 }
 
 fn linear_from_srgb_table() -> [f32; 256] {
@@ -133,6 +140,51 @@ mod tests {
         // Two opposite slopes side by side are a flat surface from afar.
         let chain = MipChain::from_texels([2, 1], Texels::Slopes, vec![128 + 100, 128, 128 - 100, 128 + 40]);
         assert_eq!(chain.levels[1], [128, 148]);
+    }
+
+    /// Pseudo-random codes 1 to 255, red and green.
+    fn rough_texels(num_texels: usize) -> Vec<u8> {
+        let mut state = 1_u32;
+        let mut next = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (1 + (state >> 8) % 255) as u8
+        };
+        (0..num_texels * 2).map(|_| next()).collect()
+    }
+
+    #[test]
+    fn any_uniform_slope_stays_what_it_is_down_to_one_texel() {
+        for code in 0..=255 {
+            let chain = MipChain::uniform([16, 4], Texels::Slopes, &[code, 255 - code]);
+            assert!(chain.levels.iter().all(|level| level.as_chunks::<2>().0.iter().all(|texel| *texel == [code, 255 - code])), "{code}");
+        }
+    }
+
+    #[test]
+    fn opposite_slopes_stay_opposite_down_to_one_texel() {
+        let texels = rough_texels(64 * 64);
+        let opposite = texels.iter().map(|code| (256 - u32::from(*code)) as u8).collect();
+        let chains = [texels, opposite].map(|base| MipChain::from_texels([64, 64], Texels::Slopes, base));
+        for (level, opposite) in chains[0].levels.iter().zip(&chains[1].levels) {
+            assert!(level.iter().zip(opposite).all(|(a, b)| u32::from(*a) + u32::from(*b) == 256), "{} bytes", level.len());
+        }
+    }
+
+    /// Steep slopes, and slopes of a code or two, where rounding is most of what there is.
+    #[test]
+    fn slopes_of_mean_zero_keep_it() {
+        for shallow in [1.0, 0.02] {
+            // Each texel and, scattered elsewhere, its opposite: the mean is exactly 128.
+            let half: Vec<u8> =
+                rough_texels(512 * 256).iter().map(|code| (128.0 + (f32::from(*code) - 128.0) * shallow).round() as u8).collect();
+            let opposite = (0..half.len()).map(|i| (256 - u32::from(half[i * 40_503 % half.len()])) as u8);
+            let chain = MipChain::from_texels([512, 512], Texels::Slopes, half.iter().copied().chain(opposite).collect());
+            // With fewer texels than that the mean of what rounding leaves of each is no longer small.
+            for level in chain.levels.iter().filter(|level| level.len() >= 2 * 64 * 64) {
+                let mean = level.iter().map(|code| f64::from(*code)).sum::<f64>() / level.len() as f64;
+                assert!((mean - 128.0).abs() < 0.02, "mean {mean} of a level of {} bytes", level.len());
+            }
+        }
     }
 
     #[test]

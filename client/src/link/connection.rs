@@ -32,6 +32,8 @@ pub(super) enum Ended {
     Stopped,
     /// Trying again may help.
     Lost(String),
+    /// The character could not be had. Trying again may help, but costs.
+    NoCharacter(String),
     /// Trying again will not.
     Refused(String),
 }
@@ -232,8 +234,8 @@ impl Connection<'_> {
         let character = if self.options.known_sha256.as_ref() == Some(wanted) {
             CharacterSource::Known
         } else {
-            let glb =
-                fetch::character(&self.options.server, &hello.character.url, wanted).map_err(|error| Ended::Lost(error.to_string()))?;
+            let glb = fetch::character(&self.options.server, &hello.character.url, wanted)
+                .map_err(|error| Ended::NoCharacter(error.to_string()))?;
             self.options.known_sha256 = Some(wanted.clone());
             CharacterSource::Fetched(glb)
         };

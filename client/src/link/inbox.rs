@@ -1,6 +1,6 @@
 //! What lies between the link's thread and the picture's: bounded, and the newest wins.
 
-use super::{Connected, LinkState, LinkStats};
+use super::{CharacterSource, Connected, LinkState, LinkStats};
 use rhytid_shared::FaceFrame;
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -48,8 +48,14 @@ impl Inbox {
         Self { inner: Mutex::new(inner), stopped: Condvar::new() }
     }
 
-    pub(super) fn connected(&self, connected: Connected) {
+    pub(super) fn connected(&self, mut connected: Connected) {
         let mut inner = self.lock();
+        // What counts as known was fetched last; where nobody has taken it from here yet, this is the only copy.
+        if connected.character == CharacterSource::Known
+            && let Some(Connected { character: fetched @ CharacterSource::Fetched(_), .. }) = inner.news.connected.take()
+        {
+            connected.character = fetched;
+        }
         inner.news.frames.clear();
         inner.news.connected = Some(connected);
         inner.state = LinkState::Live;

@@ -3,8 +3,10 @@
 #![allow(clippy::result_large_err, reason = "tungstenite's callbacks are declared so")]
 
 use super::*;
+use crate::spectator::{Spectator, Status, StatusKind, WatchArgs};
 use rhytid_shared::packet::{Encoder, PacketLayout};
 use rhytid_shared::view::{BoneHello, CharacterHello, PROTOCOL_VERSION, PoseHello, SUBPROTOCOL, ViewMessage};
+use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -287,6 +289,24 @@ fn unknown_character_is_fetched_once() {
 }
 
 #[test]
+fn fetched_character_waits_through_a_reconnection() {
+    let glb = b"glTF in spirit".to_vec();
+    let sha256: String = Sha256::digest(&glb).iter().map(|byte| format!("{byte:02x}")).collect();
+    let server = TestServer::start();
+    let mut link = Link::open(server.options("another"), || ());
+    let mut socket = server.accept();
+    send_hello(&mut socket, &hello(&sha256));
+    server.serve_file(&glb);
+    wait_for("the first hello", || (link.stats().connects == 1).then_some(()));
+    // A busy window has taken nothing when the connection breaks and comes back.
+    drop(socket);
+    let mut socket = server.accept();
+    send_hello(&mut socket, &hello(&sha256));
+    wait_for("the second hello", || (link.stats().connects == 2).then_some(()));
+    assert_eq!(link.take_news().connected.map(|connected| connected.character), Some(CharacterSource::Fetched(glb)));
+}
+
+#[test]
 fn character_of_another_hash_is_not_taken() {
     let server = TestServer::start();
     let mut link = Link::open(server.options("a"), || ());
@@ -297,6 +317,9 @@ fn character_of_another_hash_is_not_taken() {
         _ => None,
     });
     assert!(why.contains("has SHA-256") && why.contains("expected 0000"), "{why}");
+    // The next attempt may load as much again: it does not come within a blink as after a broken connection.
+    let LinkState::Lost { retry_at, .. } = link.state() else { panic!("{:?}", link.state()) };
+    assert!(retry_at.saturating_duration_since(Instant::now()) > Duration::from_secs(1));
     assert!(link.take_news().connected.is_none());
 }
 
@@ -312,6 +335,117 @@ fn character_elsewhere_is_not_fetched() {
         _ => None,
     });
     assert!(why.contains("expected a path"), "{why}");
+}
+
+/// A spectator of the two-bone character, its server's first connection accepted and greeted.
+fn watch(server: &TestServer) -> (Spectator, Socket) {
+    let character = two_bones();
+    let spectator =
+        Spectator::open(WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap() }, Arc::new(character), || ());
+    let mut socket = server.accept();
+    send_hello(&mut socket, &hello("a"));
+    (spectator, socket)
+}
+
+/// The default character, cut down to what [`hello`] describes.
+fn two_bones() -> Character {
+    let mut character = Character::from_glb(DEFAULT_CHARACTER_GLB).unwrap();
+    character.bones.truncate(2);
+    character.poses.truncate(1);
+    character.poses[0].points.truncate(2);
+    character.shapes.clear();
+    character.sha256 = "a".into();
+    character
+}
+
+fn wait_for_status(spectator: &mut Spectator, kind: StatusKind) -> Status {
+    wait_for(&format!("{kind:?}"), || {
+        spectator.update(|_| Err("this test has one character".into()));
+        let now = Instant::now();
+        spectator.sample(now);
+        let status = spectator.status(now);
+        (status.kind == kind).then_some(status)
+    })
+}
+
+#[test]
+fn status_follows_the_sender_from_waiting_to_gone() {
+    let server = TestServer::start();
+    let (mut spectator, mut socket) = watch(&server);
+    let status = wait_for_status(&mut spectator, StatusKind::Waiting);
+    assert!(status.headline == "Waiting for a face" && status.detail.contains("room demo"), "{status:?}");
+
+    socket.send(Message::binary(packets(1).remove(0))).unwrap();
+    assert_eq!(wait_for_status(&mut spectator, StatusKind::Live).headline, "Live");
+    // A sender that falls silent is told from one that has gone.
+    assert_eq!(wait_for_status(&mut spectator, StatusKind::Silent).headline, "Sender silent");
+    assert_eq!(wait_for_status(&mut spectator, StatusKind::Idle).headline, "Sender gone");
+}
+
+#[test]
+fn status_says_face_lost_when_the_tracker_does() {
+    let server = TestServer::start();
+    let (mut spectator, mut socket) = watch(&server);
+    let layout = PacketLayout::try_from(&hello("a").character).unwrap();
+    let mut frame = layout.frame_at_rest();
+    (frame.session, frame.face) = (1, false);
+    let mut packet = Vec::new();
+    Encoder::new(layout).encode(&frame, &mut packet);
+    socket.send(Message::binary(packet)).unwrap();
+    let status = wait_for_status(&mut spectator, StatusKind::FaceLost);
+    assert!(status.headline == "Face lost" && status.detail.contains("sees no face"), "{status:?}");
+}
+
+#[test]
+fn status_says_that_the_server_is_gone_and_when_it_is_back() {
+    let server = TestServer::start();
+    let (mut spectator, socket) = watch(&server);
+    wait_for_status(&mut spectator, StatusKind::Waiting);
+    drop(socket);
+    let status = wait_for_status(&mut spectator, StatusKind::ServerGone);
+    assert!(status.headline == "Server gone" && status.detail.contains("the connection broke; trying again"), "{status:?}");
+    let mut socket = server.accept();
+    send_hello(&mut socket, &hello("a"));
+    wait_for_status(&mut spectator, StatusKind::Waiting);
+    socket.send(Message::binary(packets(1).remove(0))).unwrap();
+    wait_for_status(&mut spectator, StatusKind::Live);
+}
+
+#[test]
+fn status_tells_attempts_in_vain_and_refusals() {
+    let server = TestServer::start();
+    let watched = WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap() };
+    let mut spectator = Spectator::open(watched.clone(), Arc::new(two_bones()), || ());
+    assert_eq!(spectator.status(Instant::now()).kind, StatusKind::Connecting);
+    server.accept_with(|_, _| {
+        let mut response = ErrorResponse::new(Some("go away".into()));
+        *response.status_mut() = StatusCode::FORBIDDEN;
+        response.headers_mut().insert("Content-Length", HeaderValue::from_static("7"));
+        Err(response)
+    });
+    assert_eq!(wait_for_status(&mut spectator, StatusKind::Refused).detail, "go away");
+    drop(server);
+    let mut spectator = Spectator::open(watched, Arc::new(two_bones()), || ());
+    wait_for("the third attempt in vain", || {
+        let status = spectator.status(Instant::now());
+        spectator.update(|_| Err(String::new()));
+        status.detail.contains("attempt 3 failed").then_some(())
+    });
+}
+
+#[test]
+fn character_that_cannot_be_drawn_is_said() {
+    let glb = b"glTF in spirit".to_vec();
+    let sha256: String = Sha256::digest(&glb).iter().map(|byte| format!("{byte:02x}")).collect();
+    let server = TestServer::start();
+    let (mut spectator, socket) = watch(&server);
+    wait_for_status(&mut spectator, StatusKind::Waiting);
+    drop(socket);
+    let mut socket = server.accept();
+    send_hello(&mut socket, &hello(&sha256));
+    server.serve_file(&glb);
+    let status = wait_for_status(&mut spectator, StatusKind::Unusable);
+    assert_eq!(status.detail, "this test has one character");
 }
 
 #[test]

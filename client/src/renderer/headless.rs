@@ -27,7 +27,13 @@ pub enum RenderError {
         /// Largest side.
         most: u32,
     },
-    /// The device was lost or ran out of memory.
+    /// The device has not the memory for a picture of this size.
+    #[error("a picture of {}x{} pixels needs more memory than the GPU adapter gives", got[0], got[1])]
+    OutOfMemory {
+        /// What was asked for.
+        got: [u32; 2],
+    },
+    /// The device was lost.
     #[error("reading the picture back failed: {0}")]
     ReadBack(String),
 }
@@ -78,8 +84,13 @@ impl Headless {
 
     /// Draws one picture and waits for it.
     pub fn render(&mut self, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> Result<RgbaImage, RenderError> {
+        // Without a scope wgpu's own handler would end the program.
+        let scope = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let target = self.target(size)?;
         let encoder = self.record(&target, size, settings, frame);
+        if pollster::block_on(scope.pop()).is_some() {
+            return Err(RenderError::OutOfMemory { got: size });
+        }
         read_back(&self.device, &self.queue, encoder, &target, size)
     }
 

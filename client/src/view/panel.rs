@@ -205,13 +205,17 @@ fn numbers(ui: &mut Ui, scene: &Scene<'_>) {
     let (link, playout, rates) = (&scene.link, &scene.playout, scene.rates);
     // Half the way there and back, and what playout adds; the sender's own clock cannot be compared with ours.
     let latency = link.round_trip.map_or_else(|| "–".into(), |way| millis(way / 2 + playout.delay));
+    let packets = format!("Frame packets received a second; the sender makes one every {}", millis(playout.send_interval));
+    let delay =
+        format!("Playout delay: how much later than possible the face is shown, so that it moves evenly; {} frames wait", playout.buffered);
+    let jitter = format!("95 % of packets are late by no more than this; {} times none was there in time", playout.underruns);
     let numbers = [
         ("Pictures", a_second(rates.pictures.per_second()), "Pictures drawn a second"),
         ("Latency", latency, "Server to screen: half a round trip and the playout delay"),
-        ("Packets", a_second(rates.packets.per_second()), "Frame packets received a second"),
-        ("Delay", millis(playout.delay), "Playout delay: how much later than possible the face is shown, so that it moves evenly"),
+        ("Packets", a_second(rates.packets.per_second()), &packets),
+        ("Delay", millis(playout.delay), &delay),
         ("Bytes", bytes_a_second(rates.bytes.per_second()), "Payload of frame packets a second"),
-        ("Jitter", millis(playout.jitter), "95 % of packets are late by no more than this"),
+        ("Jitter", millis(playout.jitter), &jitter),
     ];
     let gap = 20.0;
     let width = (ui.available_width() - gap) / 2.0;
@@ -227,9 +231,10 @@ fn numbers(ui: &mut Ui, scene: &Scene<'_>) {
             }
         });
     }
-    let skipped = playout.late + playout.duplicates + playout.misfits + link.garbage;
+    let skipped = playout.late + playout.duplicates + playout.misfits + link.garbage + link.overflowed;
     let skipped = if skipped == 0 { String::new() } else { format!("{skipped} packets skipped · ") };
-    ui.label(RichText::new(format!("{skipped}{}", scene.adapter)).small().color(FAINT));
+    let connects = if link.connects <= 1 { String::new() } else { format!("{} connections · ", link.connects) };
+    ui.label(RichText::new(format!("{skipped}{connects}{}", scene.adapter)).small().color(FAINT));
 }
 
 fn a_second(rate: f64) -> String {

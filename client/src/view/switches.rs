@@ -120,3 +120,98 @@ impl Switches {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use egui::{Event, RawInput};
+    use rhytid_shared::DEFAULT_CHARACTER_GLB;
+
+    struct Desk {
+        character: Character,
+        switches: Switches,
+    }
+
+    impl Desk {
+        fn new() -> Self {
+            let character = Character::from_glb(DEFAULT_CHARACTER_GLB).unwrap();
+            Self { switches: Switches::new(&character), character }
+        }
+
+        fn press(&mut self, key: Key) -> &Switches {
+            let event = Event::Key { key, physical_key: None, pressed: true, repeat: false, modifiers: Modifiers::NONE };
+            let context = egui::Context::default();
+            let mut output = context.run_ui(RawInput { events: vec![event], ..RawInput::default() }, |ui| {
+                ui.input_mut(|input| self.switches.obey_keys(input, &self.character));
+            });
+            output.textures_delta.clear();
+            &self.switches
+        }
+    }
+
+    #[test]
+    fn keys_one_to_six_choose_the_views_in_their_order() {
+        let mut desk = Desk::new();
+        let keys = [Key::Num6, Key::Num5, Key::Num4, Key::Num3, Key::Num2, Key::Num1];
+        let views: Vec<ViewMode> = keys.iter().map(|&key| desk.press(key).draw.view).collect();
+        let expected =
+            [ViewMode::Wireframe, ViewMode::Normals, ViewMode::Influence(None), ViewMode::Split, ViewMode::Bare, ViewMode::Beauty];
+        assert_eq!(views, expected);
+    }
+
+    #[test]
+    fn influence_pressed_again_goes_through_the_poses_and_back_to_all() {
+        let mut desk = Desk::new();
+        desk.press(Key::Num4);
+        for k in 0..desk.character.num_poses() {
+            assert_eq!(desk.press(Key::Num4).draw.view, ViewMode::Influence(Some(k)));
+        }
+        assert_eq!(desk.press(Key::Num4).draw.view, ViewMode::Influence(None));
+        // The pose is kept while another view is on.
+        desk.press(Key::Num4);
+        desk.press(Key::Num1);
+        assert_eq!(desk.press(Key::Num4).draw.view, ViewMode::Influence(Some(0)));
+    }
+
+    #[test]
+    fn letters_switch_what_they_say_and_nothing_else() {
+        let mut desk = Desk::new();
+        let before = desk.switches.clone();
+        assert!(!desk.press(Key::W).draw.wrinkles);
+        assert!(!desk.press(Key::H).has_panel);
+        assert!(desk.press(Key::F).is_full_screen);
+        for mode in [1, 2, 0].map(|at| BlendMode::ALL[at]) {
+            assert_eq!(desk.press(Key::B).draw.blend, mode);
+        }
+        for key in [Key::W, Key::H, Key::F] {
+            desk.press(key);
+        }
+        assert_eq!(desk.switches, before, "pressed again they switch back");
+        assert!(desk.press(Key::Escape).is_quitting);
+    }
+
+    #[test]
+    fn face_follows_the_pointer_and_the_wheel_and_r_brings_it_back() {
+        let mut desk = Desk::new();
+        let front = desk.switches.draw.camera;
+        desk.switches.drag(egui::vec2(50.0, 0.0), 500.0);
+        // Dragged to the right the face turns to its own left: the camera goes to its right, -X.
+        assert!(desk.switches.draw.camera.eye().x < front.eye().x - 0.01);
+        desk.switches.drag(egui::vec2(0.0, 50.0), 500.0);
+        assert!(desk.switches.draw.camera.eye().y > front.eye().y + 0.01, "dragged down it shows its crown");
+        desk.switches.scroll(100.0);
+        assert!(desk.switches.draw.camera.distance < front.distance * 0.9);
+        desk.switches.scroll(-200.0);
+        assert!(desk.switches.draw.camera.distance > front.distance * 1.1);
+        assert_eq!(desk.press(Key::R).draw.camera, front);
+    }
+
+    #[test]
+    fn pose_that_another_character_lacks_is_shown_no_more() {
+        let mut desk = Desk::new();
+        desk.switches.choose_pose(Some(desk.character.num_poses() - 1));
+        desk.character.poses.truncate(1);
+        desk.switches.change_character(&desk.character);
+        assert_eq!(desk.switches.draw.view, ViewMode::Influence(None));
+    }
+}

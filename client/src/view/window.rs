@@ -9,6 +9,7 @@ use crate::asset::CharacterAsset;
 use crate::renderer::{RenderError, RenderFrame, Renderer, read_back, required_limits};
 use image::RgbaImage;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use winit::event::WindowEvent;
 use winit::event_loop::ActiveEventLoop;
 use winit::window::{Fullscreen, Window};
@@ -18,9 +19,17 @@ const FACE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
 
 /// Everything that goes with one window.
 pub(super) struct GpuWindow {
-    window: Arc<Window>,
+    // Before the window: what is declared first is dropped first.
     surface: wgpu::Surface<'static>,
+    window: Arc<Window>,
+    instance: wgpu::Instance,
     surface_config: wgpu::SurfaceConfiguration,
+    /// The window has an area; a minimised one may have none.
+    has_area: bool,
+    /// The picture being drawn is not of the kind the surface likes best: it wants to be configured after it.
+    is_suboptimal: bool,
+    /// Set by wgpu when the device is gone: a driver that was updated or crashed, a GPU that was unplugged.
+    is_lost: Arc<AtomicBool>,
     adapter_name: String,
     device: wgpu::Device,
     queue: wgpu::Queue,
@@ -36,21 +45,22 @@ struct FaceTexture {
     id: egui::TextureId,
 }
 
-/// What became of a picture.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Drawn {
-    /// It is on the screen.
-    Shown,
-    /// The surface had changed; draw again.
+/// What there is to draw into.
+#[derive(Debug)]
+pub(super) enum Canvas {
+    /// The next picture of the window.
+    Ready(wgpu::SurfaceTexture),
+    /// The surface had changed or was not ready; ask again.
     Again,
     /// Nobody can see the window now.
     Hidden,
+    /// The device is gone, and with it everything but the window.
+    DeviceLost,
 }
 
 impl GpuWindow {
-    /// Opens a surface on `window` and uploads the character.
-    pub(super) fn new(event_loop: &ActiveEventLoop, window: Window, asset: &CharacterAsset) -> Result<Self, WindowError> {
-        let window = Arc::new(window);
+    /// Opens a surface on `window`, which must have no other, and uploads the character.
+    pub(super) fn new(event_loop: &ActiveEventLoop, window: Arc<Window>, asset: &CharacterAsset) -> Result<Self, WindowError> {
         let display = Box::new(event_loop.owned_display_handle());
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_with_display_handle_from_env(display));
         let surface = instance.create_surface(Arc::clone(&window)).map_err(|error| WindowError::Surface(error.to_string()))?;
@@ -61,6 +71,8 @@ impl GpuWindow {
             wgpu::DeviceDescriptor { label: Some("rhytid window"), required_limits: required_limits(&adapter), ..Default::default() };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
+
+        let is_lost = watch(&device);
 
         let size = window.inner_size();
         let mut surface_config = surface
@@ -91,7 +103,27 @@ impl GpuWindow {
         let mut painter = Painter::new(&device, surface_config.format);
         let renderer = Renderer::new(&device, &queue, asset, FACE_FORMAT);
         let face = FaceTexture::new(&device, &mut painter, [1, 1], None);
-        Ok(Self { window, surface, surface_config, adapter_name: info.name, device, queue, renderer, face, egui, painter })
+        Ok(Self {
+            surface,
+            window,
+            instance,
+            surface_config,
+            has_area: size.width > 0 && size.height > 0,
+            is_suboptimal: false,
+            is_lost,
+            adapter_name: info.name,
+            device,
+            queue,
+            renderer,
+            face,
+            egui,
+            painter,
+        })
+    }
+
+    /// The window alone; everything on the device is dropped.
+    pub(super) fn into_window(self) -> Arc<Window> {
+        self.window
     }
 
     /// The window itself.
@@ -106,8 +138,12 @@ impl GpuWindow {
 
     /// Follows the window's size.
     pub(super) fn resize(&mut self, width: u32, height: u32) {
+        self.has_area = width > 0 && height > 0;
+        if !self.has_area {
+            return;
+        }
         let most = self.device.limits().max_texture_dimension_2d;
-        (self.surface_config.width, self.surface_config.height) = (width.clamp(1, most), height.clamp(1, most));
+        (self.surface_config.width, self.surface_config.height) = (width.min(most), height.min(most));
         self.surface.configure(&self.device, &self.surface_config);
     }
 
@@ -131,33 +167,51 @@ impl GpuWindow {
         self.egui.egui_ctx().has_requested_repaint()
     }
 
-    /// Lays out and draws one picture of the window, and shows it.
-    pub(super) fn draw(&mut self, scene: &Scene<'_>, switches: &mut Switches) -> Result<Drawn, WindowError> {
-        let (primitives, pixels_per_point, freed) = self.lay_out(scene, switches);
-        let (texture, is_suboptimal) = match self.surface.get_current_texture() {
-            wgpu::CurrentSurfaceTexture::Success(texture) => (texture, false),
-            wgpu::CurrentSurfaceTexture::Suboptimal(texture) => (texture, true),
-            wgpu::CurrentSurfaceTexture::Outdated | wgpu::CurrentSurfaceTexture::Lost => {
+    /// Waits until there is something to draw into. What is drawn shall be sampled after this: the wait may take a whole
+    /// picture's time.
+    pub(super) fn acquire(&mut self) -> Result<Canvas, WindowError> {
+        if self.is_lost.load(Ordering::SeqCst) {
+            return Ok(Canvas::DeviceLost);
+        }
+        if !self.has_area {
+            return Ok(Canvas::Hidden);
+        }
+        match self.surface.get_current_texture() {
+            wgpu::CurrentSurfaceTexture::Success(texture) => Ok(Canvas::Ready(texture)),
+            wgpu::CurrentSurfaceTexture::Suboptimal(texture) => {
+                self.is_suboptimal = true;
+                Ok(Canvas::Ready(texture))
+            }
+            wgpu::CurrentSurfaceTexture::Outdated => {
                 self.surface.configure(&self.device, &self.surface_config);
-                self.painter.free(freed);
-                return Ok(Drawn::Again);
+                Ok(Canvas::Again)
             }
-            wgpu::CurrentSurfaceTexture::Timeout | wgpu::CurrentSurfaceTexture::Occluded => {
-                self.painter.free(freed);
-                return Ok(Drawn::Hidden);
+            wgpu::CurrentSurfaceTexture::Lost => {
+                self.surface =
+                    self.instance.create_surface(Arc::clone(&self.window)).map_err(|error| WindowError::Surface(error.to_string()))?;
+                self.surface.configure(&self.device, &self.surface_config);
+                Ok(Canvas::Again)
             }
-            wgpu::CurrentSurfaceTexture::Validation => return Err(WindowError::Surface("the surface gave no picture to draw into".into())),
-        };
-        let view = texture.texture.create_view(&wgpu::TextureViewDescriptor::default());
+            wgpu::CurrentSurfaceTexture::Timeout => Ok(Canvas::Again),
+            wgpu::CurrentSurfaceTexture::Occluded => Ok(Canvas::Hidden),
+            // A device that was just lost shows here first.
+            wgpu::CurrentSurfaceTexture::Validation if self.is_lost.load(Ordering::SeqCst) => Ok(Canvas::DeviceLost),
+            wgpu::CurrentSurfaceTexture::Validation => Err(WindowError::Surface("the surface gave no picture to draw into".into())),
+        }
+    }
+
+    /// Lays out and draws one picture of the window into `canvas`, and shows it.
+    pub(super) fn draw(&mut self, canvas: wgpu::SurfaceTexture, scene: &Scene<'_>, switches: &mut Switches) {
+        let (primitives, pixels_per_point, freed) = self.lay_out(scene, switches);
+        let view = canvas.texture.create_view(&wgpu::TextureViewDescriptor::default());
         let encoder = self.record(&view, &primitives, pixels_per_point, scene.frame, switches);
         self.queue.submit([encoder.finish()]);
         self.painter.free(freed);
         self.window.pre_present_notify();
-        self.queue.present(texture);
-        if is_suboptimal {
+        self.queue.present(canvas);
+        if std::mem::take(&mut self.is_suboptimal) {
             self.surface.configure(&self.device, &self.surface_config);
         }
-        Ok(Drawn::Shown)
     }
 
     /// Draws the window's picture and returns it instead of showing it.
@@ -221,6 +275,27 @@ impl GpuWindow {
         self.painter.paint(&self.device, &self.queue, &mut encoder, target, size, pixels_per_point, primitives);
         encoder
     }
+}
+
+/// Says in the log what wgpu complains of (its own handler would end the program), and sets the flag returned when the
+/// device is gone.
+fn watch(device: &wgpu::Device) -> Arc<AtomicBool> {
+    let has_complained = AtomicBool::new(false);
+    device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+        // What is wrong with one picture is wrong with the next.
+        if has_complained.swap(true, Ordering::SeqCst) {
+            tracing::debug!(%error, "wgpu");
+        } else {
+            tracing::error!(%error, "wgpu");
+        }
+    }));
+    let is_lost = Arc::new(AtomicBool::new(false));
+    let flag = Arc::clone(&is_lost);
+    device.set_device_lost_callback(move |reason, message| {
+        tracing::warn!(?reason, message, "the GPU device is gone");
+        flag.store(true, Ordering::SeqCst);
+    });
+    is_lost
 }
 
 impl FaceTexture {

@@ -221,6 +221,7 @@ impl Character {
                 format!("is {}, this program reads {}", face.version, schema::VERSION),
             ));
         }
+        let head_pivot = check_point(head_pivot.to_array(), || format!("nodes: the origin of {:?}", face.head))?;
         let ibug68 = check_landmarks(face)?;
         let bones = check_bones(&face.bones)?;
         let index_of: BTreeMap<&str, usize> = bones.iter().enumerate().map(|(i, bone)| (bone.name.as_str(), i)).collect();

@@ -5,13 +5,11 @@ use super::{MessageError, PublishHello, PublishMessage, TrackingData, TrackingFr
 use crate::character::Character;
 use crate::face::HeadPose;
 use crate::layout::Layout;
-use crate::limits::MAX_FEATURE_POINTS;
+use crate::limits::{MAX_FEATURE_POINTS, MAX_SECONDS};
 use crate::names::NUM_ARKIT_SHAPES;
 use crate::view::PROTOCOL_VERSION;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Largest `t`, seconds: the Unix clock stays below it for three centuries, and it fits a packet's microseconds.
-const MAX_SECONDS: f64 = 1e10;
 /// Largest side of a tracker's picture and largest focal length, pixels.
 const MAX_IMAGE: f64 = 1e5;
 /// Most frames a second a hello may claim: faster than any face camera.
@@ -25,6 +23,8 @@ pub struct PublishReader {
     fields: Fields,
     hello: Option<PublishHello>,
     last_t: Option<f64>,
+    /// `last_t` as it was before the newest frame.
+    t_before: Option<f64>,
 }
 
 /// What a character calls its parts.
@@ -41,13 +41,13 @@ impl PublishReader {
             bones: character.bones.iter().enumerate().map(|(i, bone)| (bone.name.clone(), i)).collect(),
             features: character.features.keys().cloned().collect(),
         };
-        Self { names: Some(names), fields: Fields::new(), hello: None, last_t: None }
+        Self { names: Some(names), fields: Fields::new(), hello: None, last_t: None, t_before: None }
     }
 
     /// A reader for a sender, which does not know the character at the other end: names of bones and of feature points are
     /// not checked, and the bones of a frame are left out.
     pub fn for_any_character() -> Self {
-        Self { names: None, fields: Fields::new(), hello: None, last_t: None }
+        Self { names: None, fields: Fields::new(), hello: None, last_t: None, t_before: None }
     }
 
     /// Reads one message. A frame is written into `frame`, whose buffers are reused; after an error `frame` is as it was.
@@ -72,6 +72,12 @@ impl PublishReader {
             (Kind::Calibrate, Some(_)) => Ok(PublishMessage::Calibrate),
             (Kind::Frame, Some(_)) => self.check_frame(frame).map(|()| PublishMessage::Frame),
         }
+    }
+
+    /// The frame last read was refused by what comes after the reader: the session's clock stands as it did before that frame,
+    /// so that one bad time does not shut out all later frames.
+    pub fn take_back(&mut self) {
+        self.last_t = self.t_before;
     }
 
     fn check_hello(&mut self) -> Result<PublishHello, MessageError> {
@@ -151,7 +157,7 @@ impl PublishReader {
             }
         }
         frame.t = t;
-        self.last_t = Some(t);
+        self.t_before = self.last_t.replace(t);
         Ok(())
     }
 }
@@ -325,6 +331,7 @@ mod tests {
             (r#"{"type":"frame","t":0.5,"face":false}"#, "time_order", "expected more than the 1"),
             (r#"{"type":"frame","t":-1,"face":false}"#, "out_of_range", "field t is -1"),
             (r#"{"type":"frame","t":1e300,"face":false}"#, "out_of_range", "field t"),
+            (r#"{"type":"frame","t":9000000001,"face":false}"#, "out_of_range", "expected seconds from 0 to 9000000000"),
             (r#"{"type":"frame","t":2,"landmarks":[[1,2]]}"#, "wrong_count", "field landmarks has 1 points, expected 2"),
             (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3,4],[5,6]]}"#, "wrong_count", "has 3 points"),
             (r#"{"type":"frame","t":2,"landmarks":[[1,2],[3]]}"#, "wrong_count", "landmarks[1] has 1 numbers"),
@@ -353,6 +360,22 @@ mod tests {
             assert_eq!(frame, before, "{text}");
         }
         reader.read(r#"{"type":"frame","t":1.01,"face":false}"#, &mut frame).unwrap();
+    }
+
+    #[test]
+    fn a_frame_taken_back_leaves_the_clock_as_it_was() {
+        let (mut reader, mut frame) = after_hello();
+        let mut read = |reader: &mut PublishReader, t: f64| reader.read(&format!(r#"{{"type":"frame","t":{t},"face":false}}"#), &mut frame);
+        read(&mut reader, 1.0).unwrap();
+        read(&mut reader, MAX_SECONDS).unwrap();
+        reader.take_back();
+        assert_eq!(read(&mut reader, 1.0).unwrap_err().code, "time_order", "the frame before still counts");
+        read(&mut reader, 2.0).unwrap();
+        // Also the first of all.
+        let (mut reader, _) = after_hello();
+        read(&mut reader, 5.0).unwrap();
+        reader.take_back();
+        read(&mut reader, 0.0).unwrap();
     }
 
     #[test]

@@ -6,6 +6,8 @@
 mod golden;
 mod probe;
 mod properties;
+mod read_back;
+mod twins;
 
 use libtest_mimic::{Arguments, Trial};
 use rhytid_client::renderer::AdapterChoice;
@@ -41,7 +43,7 @@ fn main() -> ExitCode {
         });
         trials.push(trial.with_ignored_flag(stage.is_none()));
     };
-    probe::add(&mut add);
+    twins::add(&mut add);
     properties::add(&mut add);
     golden::add(&mut add);
     libtest_mimic::run(&arguments, trials).exit_code()

@@ -1,11 +1,11 @@
 //! A server on a free port, and clients for it.
 
-use rhytid_server::{ServerConfig, bind, run};
+use rhytid_server::{ServerConfig, bind, load_character, run};
 use rhytid_shared::FaceFrame;
 use rhytid_shared::packet::{Decoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{JsonFrame, ViewHello, ViewMessage};
 use std::io::{Read, Write};
-use std::net::{SocketAddr, TcpStream};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::sync::mpsc;
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -40,8 +40,13 @@ impl Server {
             let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
             runtime.block_on(async {
                 let listener = bind(&config.listen).await.unwrap();
-                bound.send(listener.local_addr().unwrap()).unwrap();
-                run(listener, config, async { drop(stopped.await) }).await.unwrap();
+                let mut address = listener.local_addr().unwrap();
+                if address.ip().is_unspecified() {
+                    address.set_ip(Ipv4Addr::LOCALHOST.into());
+                }
+                bound.send(address).unwrap();
+                let character = load_character(config.character.as_deref()).unwrap();
+                run(listener, config, character, async { drop(stopped.await) }).await.unwrap();
             });
         });
         Self { address: address.recv().unwrap(), stop: Some(stop), thread: Some(thread) }
@@ -216,7 +221,8 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    fn new(mut client: Client) -> Self {
+    /// Takes the hello.
+    pub fn new(mut client: Client) -> Self {
         let text = client.text();
         let Ok(ViewMessage::Hello(hello)) = serde_json::from_str(&text) else { panic!("the first message is no hello: {text}") };
         // The pong that the ping before the hello asks for.

@@ -1,12 +1,18 @@
 //! Publishers, viewers and what lies between them.
 
-use super::harness::Server;
+use super::harness::{Client, Server, Viewer};
 use rhytid_server::pipeline::Pipeline;
 use rhytid_server::{load_character, solve::SolveConfig};
+use rhytid_shared::view::JsonFrame;
 use rhytid_shared::{PublishMessage, PublishReader, TrackingFrame};
+use std::collections::BTreeSet;
+use std::path::Path;
 use std::time::{Duration, Instant};
 use tungstenite::Message;
 use tungstenite::protocol::frame::coding::CloseCode;
+
+/// Frame of the built-in session after which the face is lost: mid-expression, as it is fifty frames later.
+const LOST_FROM: usize = 300;
 
 /// Calls `act` with 0, 1, …, one each `interval`.
 fn paced(count: u32, interval: Duration, mut act: impl FnMut(u32)) {
@@ -50,15 +56,7 @@ fn fifty_viewers_see_one_face_and_nobody_hurts_another() {
             drop(gone.take());
         }
         if i == 100 {
-            let mut viewer = server.viewer("demo");
-            let joined = Instant::now();
-            assert!(viewer.next_packet());
-            // A key packet it needs first may be older; the newest frame comes with it.
-            while viewer.frame.seq < 95 {
-                assert!(viewer.next_packet());
-            }
-            assert!(joined.elapsed() < Duration::from_millis(500), "late by {:?}", joined.elapsed());
-            late = Some(viewer);
+            late = Some(server.viewer("demo"));
         }
     });
     let mut late = late.unwrap();
@@ -82,19 +80,83 @@ fn fifty_viewers_see_one_face_and_nobody_hurts_another() {
 }
 
 #[test]
-fn a_viewer_that_sleeps_finds_half_a_second_of_old_frames_and_the_newest() {
+fn a_late_viewer_gets_the_last_frame_at_once() {
     let server = Server::start();
-    let mut viewer = server.json_viewer("demo");
     let mut publisher = server.ready_publisher("demo");
-    paced(50, Duration::from_millis(20), |i| publisher.frame(f64::from(i) * 0.02, 0.5));
-    while viewer.next_json().seq < 45 {}
-    // Sleeps for four seconds: 200 frames, fewer than fit the kernel's buffers.
-    paced(200, Duration::from_millis(20), |i| publisher.frame(1.0 + f64::from(i) * 0.02, 0.5));
-    let mut num_old = 0;
-    while viewer.next_json().seq < 249 {
-        num_old += 1;
+    for i in 0..30 {
+        publisher.frame(f64::from(i) * 0.04, f64::from(i) * 0.03);
     }
-    assert!(num_old <= 30, "{num_old} old frames of 20 ms");
+    server.wait_for_room("demo", |room| room.is_some_and(|room| room["frame"]["seq"] == 29));
+    // No other frame comes: what it gets, it gets for having joined.
+    let mut late = server.viewer("demo");
+    let mut num_packets = 0;
+    while late.frame.seq < 29 {
+        assert!(late.next_packet());
+        num_packets += 1;
+    }
+    assert!(num_packets <= 2, "the key packet it needs and the newest, not {num_packets}");
+    assert_eq!(server.json_viewer("demo").next_json().seq, 29);
+}
+
+/// Publishes `count` frames after number `from`, 20 ms apart or more.
+fn publish_slowly(publisher: &mut Client, from: u32, count: u32) {
+    for i in from..from + count {
+        std::thread::sleep(Duration::from_millis(20));
+        publisher.frame(f64::from(i) * 0.02, f64::from(i % 50) * 0.02);
+    }
+}
+
+#[test]
+fn a_viewer_that_sleeps_finds_half_a_second_of_old_frames_and_the_newest() {
+    const AWAKE: u32 = 25;
+    const ASLEEP: u32 = 100;
+    let server = Server::start();
+    let mut viewer = server.viewer("demo");
+    let mut publisher = server.ready_publisher("demo");
+    let mut next = 0;
+    // A busy machine can only make it find more, by handing over several frames at once: the least of three sleeps counts.
+    let num_old = (0..3).map(|_| {
+        for _ in 0..AWAKE {
+            publish_slowly(&mut publisher, next, 1);
+            while viewer.frame.seq < next {
+                assert!(viewer.next_packet());
+            }
+            next += 1;
+        }
+        // Two seconds of frames, far fewer than fit the kernel's buffers.
+        publish_slowly(&mut publisher, next, ASLEEP);
+        let last_awake = viewer.frame.seq;
+        next += ASLEEP;
+        server.wait_for_room("demo", |room| room.is_some_and(|room| room["frame"]["seq"] == next - 1));
+        let mut old = BTreeSet::new();
+        while viewer.frame.seq < next - 1 {
+            assert!(viewer.next_packet());
+            old.insert(viewer.frame.seq);
+        }
+        // Key packets may come a second time.
+        old.range(last_awake + 1..next - 1).count()
+    });
+    let num_old = num_old.min().unwrap();
+    assert!(num_old <= 25, "{num_old} old frames of 20 ms");
+}
+
+#[test]
+fn a_viewer_that_has_never_answered_a_ping_finds_little_too() {
+    let server = Server::start();
+    // It reads nothing, not even the first ping.
+    let silent = server.connect("/v1/rooms/demo/view", &[]).unwrap();
+    let mut publisher = server.ready_publisher("demo");
+    publish_slowly(&mut publisher, 0, 200);
+    server.wait_for_room("demo", |room| room.is_some_and(|room| room["frame"]["seq"] == 199));
+    let mut viewer = Viewer::new(silent);
+    let mut old = BTreeSet::new();
+    while viewer.frame.seq < 199 {
+        assert!(viewer.next_packet());
+        old.insert(viewer.frame.seq);
+    }
+    let num_old = old.range(..199).count();
+    // Fifteen in its window, one a second after that, and as much again for a busy machine.
+    assert!((2..=40).contains(&num_old), "{num_old} old frames of 200");
 }
 
 #[test]
@@ -155,6 +217,104 @@ fn a_face_that_drops_out_is_said_to_be_lost_and_comes_back() {
             }
         }
     }
+}
+
+/// Sends a feed's lines and takes a frame for each, as fast as both ends can.
+fn play(server: &Server, room: &str, lines: &[String]) -> (Vec<JsonFrame>, Vec<[f32; 3]>) {
+    let mut viewer = server.json_viewer(room);
+    let mut publisher = server.publisher(room);
+    publisher.send(&lines[0]);
+    assert!(publisher.text().contains("ready"));
+    let mut frames = Vec::new();
+    for (i, line) in lines[1..].iter().enumerate() {
+        publisher.send(line);
+        frames.push(viewer.next_json());
+        assert_eq!(frames[i].seq as usize, i, "every frame is seen");
+    }
+    (frames, viewer.hello.character.bones.iter().map(|bone| bone.rest).collect())
+}
+
+/// The largest distance between two faces' points, metres.
+fn farthest(a: &[[f32; 3]], b: &[[f32; 3]]) -> f32 {
+    let distance = |(a, b): (&[f32; 3], &[f32; 3])| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt();
+    a.iter().zip(b).map(distance).fold(0.0, f32::max)
+}
+
+#[test]
+fn a_tracker_that_loses_the_face_holds_eases_and_returns_without_a_jump() {
+    // The built-in session, with two seconds cut out of a wide expression.
+    let text = include_str!("../../../shared/assets/demo.ibug68.jsonl");
+    let lost = LOST_FROM..LOST_FROM + 50;
+    let lines: Vec<String> = text
+        .lines()
+        .enumerate()
+        .map(|(i, line)| match i.checked_sub(1).filter(|i| lost.contains(i)) {
+            Some(_) => {
+                let frame: serde_json::Value = serde_json::from_str(line).unwrap();
+                format!(r#"{{"type":"frame","t":{},"face":false}}"#, frame["t"])
+            }
+            None => line.to_owned(),
+        })
+        .collect();
+    let server = Server::start();
+    let (frames, rest) = play(&server, "cut", &lines[..lost.end + 50]);
+    for (i, frame) in frames.iter().enumerate() {
+        assert_eq!(frame.face, !lost.contains(&i), "frame {i}");
+    }
+    let last = &frames[lost.start - 1];
+    let depth = farthest(&last.bones, &rest);
+    assert!(depth > 2e-3, "the face is {depth} m away from rest, too little to see it ease");
+    let since = |i: usize| frames[i].t - last.t;
+    for i in lost.clone() {
+        let left = farthest(&frames[i].bones, &rest);
+        if since(i) <= 0.25 {
+            assert_eq!((&frames[i].bones, &frames[i].head), (&last.bones, &last.head), "held at {i}");
+        } else if since(i) >= 0.8 {
+            assert!(left < 5e-5, "at rest at {i}, not {left} m away");
+        } else {
+            assert!(left <= farthest(&frames[i - 1].bones, &rest) + 5e-5, "eases at {i}");
+            assert!(farthest(&frames[i].bones, &frames[i - 1].bones) < depth / 2.0, "no jump at {i}");
+        }
+    }
+    // It comes back within a quarter of a second, blended in.
+    let back = lost.end..lost.end + 10;
+    let height = back.clone().map(|i| farthest(&frames[i].bones, &rest)).fold(0.0, f32::max);
+    assert!(height > 2e-3, "the face that returns is {height} m away from rest");
+    for i in back {
+        let step = farthest(&frames[i].bones, &frames[i - 1].bones);
+        assert!(step < height / 2.0, "a step of {step} m at {i} towards a face {height} m away");
+    }
+}
+
+#[test]
+fn a_face_that_appears_late_appears_without_a_jump() {
+    // A recorded session that stands beside the checkout on some machines; the built-in one with its first seconds cut elsewhere.
+    let recorded = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/feeds/dropout.ibug68.jsonl");
+    let text = std::fs::read_to_string(recorded).unwrap_or_else(|_| {
+        let text = include_str!("../../../shared/assets/demo.ibug68.jsonl");
+        let blank = |i: usize| format!(r#"{{"type":"frame","t":{},"face":false}}"#, i as f64 * 0.04);
+        let mut lines = text.lines().map(str::to_owned).take(200).collect::<Vec<_>>();
+        (1..=90).for_each(|i| lines[i] = blank(i - 1));
+        lines.join("\n")
+    });
+    let lines: Vec<String> = text.lines().map(str::to_owned).collect();
+    let server = Server::start();
+    let (frames, rest) = play(&server, "demo", &lines);
+    let first = frames.iter().position(|frame| frame.face).expect("a face appears");
+    assert!(first > 50);
+    for (i, frame) in frames[..first].iter().enumerate() {
+        assert!(farthest(&frame.bones, &rest) < 5e-5, "at rest before there is a face, at {i}");
+    }
+    for i in first..frames.len() {
+        let step = farthest(&frames[i].bones, &frames[i - 1].bones);
+        // While it is blended in; later a blink may be faster.
+        assert!(i >= first + 10 || step < 2e-3, "a step of {step} m at {i}");
+        if !frames[i].face && frames[i - 1].face {
+            assert_eq!(frames[i].bones, frames[i - 1].bones, "held at {i}");
+        }
+    }
+    let moved = frames[first..].iter().map(|frame| farthest(&frame.bones, &rest)).fold(0.0, f32::max);
+    assert!(moved > 1e-3, "the face moves, by {moved} m");
 }
 
 #[test]

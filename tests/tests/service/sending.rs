@@ -2,7 +2,10 @@
 
 use super::harness::Server;
 use rhytid_server::{SendError, SendOptions, SendReport, SendSource, send};
+use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant};
+use tungstenite::handshake::server::{ErrorResponse, Request, Response};
+use tungstenite::{Message, WebSocket};
 
 fn feed(frames: u32, interval: f64) -> String {
     let mut text = String::from("{\"type\":\"hello\",\"version\":1,\"source\":\"feed\"}\n");
@@ -20,12 +23,13 @@ fn options(server: &Server, text: String) -> SendOptions {
         speed: f64::INFINITY,
         repeats: false,
         takeover: false,
+        timeout: Duration::from_secs(15),
     }
 }
 
 fn send_now(options: &SendOptions) -> Result<SendReport, SendError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(send(options, &indicatif::ProgressBar::hidden()))
+    runtime.block_on(send(options, &indicatif::ProgressBar::hidden(), std::future::pending()))
 }
 
 #[test]
@@ -70,8 +74,79 @@ fn each_loop_is_a_session_of_its_own() {
     let mut options = options(&server, feed(5, 0.01));
     options.repeats = true;
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
-    let sending = runtime.spawn(async move { send(&options, &indicatif::ProgressBar::hidden()).await });
+    let sending = runtime.spawn(async move { send(&options, &indicatif::ProgressBar::hidden(), std::future::pending()).await });
     server.wait_for_room("demo", |room| room.is_some_and(|room| room["session"].as_u64() >= Some(3)));
     sending.abort();
     runtime.shutdown_background();
+}
+
+#[test]
+fn a_server_that_does_not_answer_is_given_up() {
+    let server = Server::start();
+    let mut options = options(&server, feed(100_000, 0.01));
+    options.timeout = Duration::from_millis(300);
+    // It accepts and says nothing, or shakes hands and says nothing.
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    options.to = format!("ws://{}", listener.local_addr().unwrap());
+    let error = send_now(&options).unwrap_err().to_string();
+    assert!(error.starts_with("cannot connect to ws://127.0.0.1:") && error.ends_with("no answer within 0.3 s"), "{error}");
+    let accept = std::thread::spawn(move || {
+        // The connection that was given up still stands in the queue.
+        drop(listener.accept().unwrap());
+        accept_publisher(listener.accept().unwrap().0)
+    });
+    let error = send_now(&options).unwrap_err().to_string();
+    assert_eq!(error, "the server ended the session: no answer to the hello within 0.3 s");
+    accept.join().unwrap();
+}
+
+#[test]
+fn a_server_that_stops_reading_is_given_up() {
+    let server = Server::start();
+    let mut options = options(&server, feed(200_000, 0.01));
+    options.timeout = Duration::from_millis(300);
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    options.to = format!("ws://{}", listener.local_addr().unwrap());
+    let accept = std::thread::spawn(move || {
+        let mut socket = accept_publisher(listener.accept().unwrap().0);
+        socket.send(Message::text(r#"{"type":"ready","session":1}"#)).unwrap();
+        socket
+    });
+    let error = send_now(&options).unwrap_err().to_string();
+    assert_eq!(error, "the server ended the session: it read nothing within 0.3 s");
+    accept.join().unwrap();
+}
+
+/// A server's end of a publish socket; the sender offers our subprotocol.
+#[allow(clippy::result_large_err, reason = "tungstenite's callbacks are declared so")]
+fn accept_publisher(stream: TcpStream) -> WebSocket<TcpStream> {
+    tungstenite::accept_hdr(stream, |request: &Request, mut response: Response| {
+        let offered = request.headers().get("Sec-WebSocket-Protocol").cloned().expect("the sender offers a subprotocol");
+        assert_eq!(offered, "rhytid.v1");
+        response.headers_mut().insert("Sec-WebSocket-Protocol", offered);
+        Ok::<_, ErrorResponse>(response)
+    })
+    .unwrap()
+}
+
+#[test]
+fn a_sender_that_is_stopped_closes_its_session() {
+    let server = Server::start();
+    let mut options = options(&server, feed(3, 100.0));
+    options.speed = 1.0;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    let stopper = std::thread::spawn({
+        let mut viewer = server.viewer("demo");
+        move || {
+            // The first frame has come, the second is due in a hundred seconds.
+            assert!(viewer.next_packet());
+            stop.send(()).unwrap();
+        }
+    });
+    let report = runtime.block_on(send(&options, &indicatif::ProgressBar::hidden(), async { drop(stopped.await) })).unwrap();
+    stopper.join().unwrap();
+    assert_eq!(report.frames, 1);
+    server.wait_for_room("demo", |room| room.is_some_and(|room| room["publisher"].is_null()));
+    assert!(server.metric("rhytid_sessions_ended_total{reason=\"closed\"}") >= 1.0, "it said that it goes");
 }
