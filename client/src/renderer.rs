@@ -4,6 +4,7 @@ mod anatomy;
 mod background;
 mod camera;
 mod coefficients;
+mod deformation;
 mod environment;
 mod frame;
 mod fullscreen;
@@ -24,6 +25,7 @@ mod view;
 
 pub use camera::Camera;
 pub use coefficients::{bone_major, moves_bone, pose_table};
+pub use deformation::{Deformation, DeformationError};
 pub use frame::RenderFrame;
 pub use headless::{AdapterChoice, Headless, RenderError, required_limits};
 pub use pipelines::VERTEX_LAYOUT;
@@ -52,6 +54,8 @@ pub struct DrawSettings {
     pub camera: Camera,
     /// What.
     pub view: ViewMode,
+    /// What deforms the face.
+    pub deform: Deformation,
     /// How wrinkle maps become normals.
     pub blend: BlendMode,
     /// Off: every influence counts as 0, but the pipeline with the wrinkle code draws.
@@ -95,6 +99,7 @@ impl DrawSettings {
         Self {
             camera,
             view: ViewMode::Beauty,
+            deform: Deformation::Bones,
             blend: BlendMode::PartialDerivatives,
             wrinkles: true,
             exposure: 1.0,
@@ -112,6 +117,7 @@ impl DrawSettings {
 pub struct Renderer {
     character: Arc<Character>,
     palette: Palette,
+    has_shapes: bool,
     bounds: Bounds,
     primitives: Vec<Primitive>,
     group: CharacterGroup,
@@ -175,6 +181,7 @@ impl Renderer {
         Self {
             character: Arc::clone(&asset.character),
             palette: asset.palette.clone(),
+            has_shapes: !asset.morphs.is_empty(),
             bounds: Bounds::new(asset),
             group,
             pipelines: Pipelines::new(&layouts, asset.character.num_poses()),
@@ -256,7 +263,13 @@ impl Renderer {
             at_rest = RenderFrame::at_rest(character);
             &at_rest
         };
-        let rows: Vec<[[f32; 4]; 3]> = self.palette.model_from_rest(character, frame).iter().map(uniforms::rows_of).collect();
+        let weights = settings.deform.weights_of(frame).filter(|_| self.has_shapes);
+        let matrices = match weights {
+            Some(_) => self.palette.model_from_unposed(character, frame),
+            None => self.palette.model_from_rest(character, frame),
+        };
+        let rows: Vec<[[f32; 4]; 3]> = matrices.iter().map(uniforms::rows_of).collect();
+        queue.write_buffer(&self.group.morph_weights, 0, bytemuck::bytes_of(&uniforms::MorphWeights::new(weights)));
         queue.write_buffer(&self.group.palette, 0, bytemuck::cast_slice(&rows));
 
         let (num_bones, num_poses) = (character.num_bones(), character.num_poses());

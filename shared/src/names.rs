@@ -121,6 +121,16 @@ impl ArkitShape {
             .map(|index| Self(index as u8))
     }
 
+    /// The shape a morph target of this name belongs to. Other heads split shapes that ARKit has once into halves
+    /// (`browInnerUp_L`, `cheekPuff_R`): both belong to the whole, and their displacements add up to it.
+    pub fn of_target(name: &str) -> Option<Self> {
+        let half = || {
+            let (stem, side) = name.split_at_checked(name.len().checked_sub(2)?)?;
+            matches!(side, "_L" | "_l" | "_R" | "_r").then_some(stem)
+        };
+        Self::from_name(name).or_else(|| Self::from_name(half()?))
+    }
+
     /// The shape at `index` of [`ARKIT_NAMES`], if there is one.
     pub fn from_index(index: usize) -> Option<Self> {
         (index < NUM_ARKIT_SHAPES).then_some(Self(index as u8))
@@ -150,6 +160,18 @@ mod tests {
         }
         for name in ["", "_neutral", "jaw", "_L", "é_L", "jawOpen_L"] {
             assert_eq!(ArkitShape::from_name(name), None, "{name}");
+        }
+    }
+
+    #[test]
+    fn halves_of_a_target_belong_to_the_whole_shape() {
+        for (name, want) in
+            [("browInnerUp_L", Some("browInnerUp")), ("cheekPuff_R", Some("cheekPuff")), ("eyeBlink_L", Some("eyeBlinkLeft"))]
+        {
+            assert_eq!(ArkitShape::of_target(name).map(ArkitShape::name), want, "{name}");
+        }
+        for name in ["", "_L", "PupilDilate_L", "cheekRaiser_R", "é_L"] {
+            assert_eq!(ArkitShape::of_target(name), None, "{name}");
         }
     }
 

@@ -4,12 +4,14 @@ use super::coefficients::pose_table;
 use super::layouts::Layouts;
 use super::regions::{self, Region};
 use super::uniforms;
-use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, PrimitiveAsset, Surface, Texels};
+use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, Morphs, PrimitiveAsset, Surface, Texels};
 use std::collections::BTreeSet;
 use wgpu::util::DeviceExt;
 
 /// Sides of a texel's footprint that are sampled at most: skin is seen at grazing angles all round its outline.
 const ANISOTROPY: u16 = 8;
+/// Half precision: 8 µm for a displacement of 16 mm.
+const MORPH_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;
 
 /// Creates objects on one device and counts their bytes.
 #[derive(Debug)]
@@ -37,11 +39,12 @@ pub struct Primitive {
     pub material: wgpu::BindGroup,
 }
 
-/// What of a character changes from frame to frame, and its wrinkle maps: group 1.
+/// What of a character changes from frame to frame, its shapes and its wrinkle maps: group 1.
 #[derive(Debug)]
 pub struct CharacterGroup {
     pub palette: wgpu::Buffer,
     pub coefficients: wgpu::Buffer,
+    pub morph_weights: wgpu::Buffer,
     pub group: wgpu::BindGroup,
 }
 
@@ -118,6 +121,8 @@ impl Uploader<'_> {
         let view =
             maps.create_view(&wgpu::TextureViewDescriptor { dimension: Some(wgpu::TextureViewDimension::D2Array), ..Default::default() });
         let sampler = self.map_sampler("wrinkle sampler");
+        let morph_deltas = self.morph_deltas(&asset.morphs);
+        let morph_weights = self.uniform("morph weights", size_of::<uniforms::MorphWeights>());
         let group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("character"),
             layout: &layouts.character,
@@ -127,9 +132,35 @@ impl Uploader<'_> {
                 entry(2, table.as_entire_binding()),
                 entry(3, wgpu::BindingResource::TextureView(&view)),
                 entry(4, wgpu::BindingResource::Sampler(&sampler)),
+                entry(5, wgpu::BindingResource::TextureView(&morph_deltas)),
+                entry(6, morph_weights.as_entire_binding()),
             ],
         });
-        CharacterGroup { palette, coefficients, group }
+        CharacterGroup { palette, coefficients, morph_weights, group }
+    }
+
+    /// The deltas of all shapes; rows are filled up with zeros.
+    fn morph_deltas(&mut self, morphs: &Morphs) -> wgpu::TextureView {
+        let [width, height] = morphs.texture_size();
+        let mut texels = morphs.texels.clone();
+        texels.resize((width * height) as usize, [half::f16::ZERO; 4]);
+        self.bytes += size_of_val(texels.as_slice()) as u64;
+        let texture = self.device.create_texture_with_data(
+            self.queue,
+            &wgpu::TextureDescriptor {
+                label: Some("morph deltas"),
+                size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+                mip_level_count: 1,
+                sample_count: 1,
+                dimension: wgpu::TextureDimension::D2,
+                format: MORPH_FORMAT,
+                usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+                view_formats: &[],
+            },
+            wgpu::util::TextureDataOrder::LayerMajor,
+            bytemuck::cast_slice(&texels),
+        );
+        texture.create_view(&wgpu::TextureViewDescriptor::default())
     }
 
     /// One part with its material.

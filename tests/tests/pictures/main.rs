@@ -4,6 +4,7 @@
 //! software adapter shows these tests as ignored.
 
 mod golden;
+mod morphs;
 mod probe;
 mod properties;
 mod read_back;
@@ -44,6 +45,7 @@ fn main() -> ExitCode {
         trials.push(trial.with_ignored_flag(stage.is_none()));
     };
     twins::add(&mut add);
+    morphs::add(&mut add);
     properties::add(&mut add);
     golden::add(&mut add);
     libtest_mimic::run(&arguments, trials).exit_code()

@@ -4,7 +4,7 @@ use crate::probe::{PLACE, Probe, Resource, What, run, texture};
 use crate::{Add, Stage};
 use anyhow::{Context, ensure};
 use glam::{Vec2, Vec3, Vec4};
-use rhytid_client::asset::Vertex;
+use rhytid_client::asset::{Morphs, Vertex};
 use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
 use rhytid_client::renderer::{VERTEX_LAYOUT, bone_major, pose_table, uniforms};
 use rhytid_client::twin::{self, WrinkleSample};
@@ -80,14 +80,13 @@ pub fn add(add: &mut Add<'_>) {
         add(format!("twins::blend_{mode}"), Box::new(move |stage| blend(stage, mode)));
         add(format!("twins::wrinkled_normal_{mode}"), Box::new(move |stage| wrinkled_normal(stage, mode)));
     }
-    add("twins::tone_map".into(), Box::new(tone_map));
 }
 
 /// A fixed sequence of values from `low` to `high`.
-struct Sequence(u32);
+pub struct Sequence(pub u32);
 
 impl Sequence {
-    fn next(&mut self, low: f32, high: f32) -> f32 {
+    pub fn next(&mut self, low: f32, high: f32) -> f32 {
         self.0 = self.0.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         low + (high - low) * ((self.0 >> 8) as f32 / 16_777_216.0)
     }
@@ -97,12 +96,12 @@ impl Sequence {
     }
 }
 
-fn headless(stage: &Stage) -> anyhow::Result<MutexGuard<'_, Headless>> {
+pub fn headless(stage: &Stage) -> anyhow::Result<MutexGuard<'_, Headless>> {
     stage.headless.lock().map_err(|_| anyhow::anyhow!("another test broke the renderer"))
 }
 
 /// A frame in which everything moves: brows, jaw, head.
-fn moving_frame(stage: &Stage) -> anyhow::Result<RenderFrame> {
+pub fn moving_frame(stage: &Stage) -> anyhow::Result<RenderFrame> {
     let character = &stage.asset.character;
     let points = posed_points(character, &character.poses[0].name, 0.8, StillSide::Left)?;
     let mut frame = RenderFrame::from(&solve_one(character, TrackingData::Bones { points, head: None })?);
@@ -116,11 +115,12 @@ fn moving_frame(stage: &Stage) -> anyhow::Result<RenderFrame> {
     Ok(frame)
 }
 
-fn all_vertices(stage: &Stage) -> Vec<Vertex> {
+pub fn all_vertices(stage: &Stage) -> Vec<Vertex> {
     stage.asset.primitives.iter().flat_map(|primitive| primitive.vertices.iter().copied()).collect()
 }
 
-fn probe_skinning(
+/// One value a vertex; shapes deform it too where the frame carries weights.
+pub fn probe_skinning(
     stage: &Stage,
     asset: &CharacterAsset,
     frame: &RenderFrame,
@@ -135,17 +135,29 @@ fn probe_skinning(
     let mut coefficients = vec![0_u8; size_of::<uniforms::CoefficientVectors>()];
     coefficients[..size_of_val(vectors.as_slice())].copy_from_slice(bytemuck::cast_slice(&vectors));
     let table = pose_table(asset);
+    let weights = uniforms::MorphWeights::new(frame.shapes.as_ref());
+    let headless = headless(stage)?;
+    let size = asset.morphs.texture_size();
+    let mut texels: Vec<u8> = bytemuck::cast_slice(&asset.morphs.texels).to_vec();
+    texels.resize((size[0] * size[1]) as usize * 8, 0);
+    let deltas = texture(&headless, wgpu::TextureFormat::Rgba16Float, size, &[texels]).create_view(&wgpu::TextureViewDescriptor::default());
     let probe = Probe {
         source: &format!("{}{PLACE}{SKINNING_PROBE}", rhytid_shaders::SKINNING),
         entries: ["vs_probe", "fs_probe"],
         constants: &[("WHICH", f64::from(which)), ("NUM_POSES", character.num_poses() as f64)],
         groups: &[(
             1,
-            &[(0, Resource::Block(&palette)), (1, Resource::Block(&coefficients)), (2, Resource::Block(bytemuck::bytes_of(&table)))],
+            &[
+                (0, Resource::Block(&palette)),
+                (1, Resource::Block(&coefficients)),
+                (2, Resource::Block(bytemuck::bytes_of(&table))),
+                (5, Resource::Texture { view: &deltas, dimension: wgpu::TextureViewDimension::D2, is_filterable: false }),
+                (6, Resource::Block(bytemuck::bytes_of(&weights))),
+            ],
         )],
         what: What::Points { layout: VERTEX_LAYOUT, bytes: bytemuck::cast_slice(vertices), count: vertices.len() },
     };
-    run(&*headless(stage)?, &probe)
+    run(&headless, &probe)
 }
 
 fn skinning(stage: &Stage) -> anyhow::Result<()> {
@@ -188,8 +200,13 @@ fn influences(stage: &Stage) -> anyhow::Result<()> {
         let coefficients: Vec<f32> = (0..num_poses * character.num_bones()).map(|_| sequence.next(0.0, 1.0)).collect();
         let frame = RenderFrame { influences: coefficients.clone(), ..RenderFrame::at_rest(&character) };
         let without_falloff = Character { falloff: 1.0, ..character.clone() };
-        let asset =
-            CharacterAsset { character: Arc::new(character), primitives: Vec::new(), palette: stage.asset.palette.clone(), wrinkles: None };
+        let asset = CharacterAsset {
+            character: Arc::new(character),
+            primitives: Vec::new(),
+            palette: stage.asset.palette.clone(),
+            morphs: Morphs::default(),
+            wrinkles: None,
+        };
         let halves = (0..num_poses.div_ceil(4) as u32)
             .map(|half| probe_skinning(stage, &asset, &frame, &vertices, 3 + half))
             .collect::<anyhow::Result<Vec<_>>>()?;
@@ -367,48 +384,5 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
         num_beyond_four += usize::from(got.distance(twin_of(MASK & 0x0F)) > 1e-2 && got.distance(twin_of(u8::MAX)) > 1e-2);
     }
     ensure!(num_beyond_four * 10 > cases.len() * 9, "only {num_beyond_four} normals depend on the poses beyond the fourth and on the mask");
-    Ok(())
-}
-
-/// The last pass itself, on light from darkness to far beyond white.
-fn tone_map(stage: &Stage) -> anyhow::Result<()> {
-    const SIZE: [u32; 2] = [64, 4];
-    let lights: Vec<[f32; 4]> = (0..SIZE[0] * SIZE[1])
-        .map(|i| {
-            // 2^-10 to 2^6, and nothing at all.
-            let light = if i == 0 { 0.0 } else { f32::exp2(i as f32 / 16.0 - 10.0) };
-            [light, light * 0.5, light * 0.25, 1.0]
-        })
-        .collect();
-    let headless = headless(stage)?;
-    let scene = texture(&headless, wgpu::TextureFormat::Rgba32Float, SIZE, &[bytemuck::cast_slice(&lights).to_vec()]);
-    let view = scene.create_view(&wgpu::TextureViewDescriptor::default());
-    for exposure in [0.5, 1.0, 2.0] {
-        let present = uniforms::Present { exposure, is_display_ready: 0, target_encodes_srgb: 1, is_split: 0 };
-        let probe = Probe {
-            source: rhytid_shaders::PRESENT,
-            entries: ["vs_present", "fs_present"],
-            constants: &[],
-            groups: &[(
-                0,
-                &[
-                    (0, Resource::Block(bytemuck::bytes_of(&present))),
-                    (1, Resource::Texture { view: &view, dimension: wgpu::TextureViewDimension::D2, is_filterable: false }),
-                ],
-            )],
-            what: What::Picture(SIZE),
-        };
-        for (light, got) in lights.iter().zip(run(&headless, &probe)?) {
-            for channel in 0..3 {
-                let twin = twin::filmic(light[channel], exposure);
-                ensure!(
-                    (got[channel] - twin).abs() < 1e-5,
-                    "light {} at exposure {exposure}: {} on the device, {twin} in the twin",
-                    light[channel],
-                    got[channel]
-                );
-            }
-        }
-    }
     Ok(())
 }
