@@ -2,7 +2,7 @@
 
 use crate::asset::{AssetError, CharacterAsset};
 use crate::picture_size::parse_size;
-use crate::renderer::{BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, ViewError, ViewMode};
+use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, ViewError, ViewMode};
 use glam::{Quat, Vec3};
 use indicatif::{ProgressBar, ProgressStyle};
 use rhytid_server::feed::{Feed, FeedError, FeedItem};
@@ -88,6 +88,9 @@ pub struct PictureArgs {
     /// How wrinkle maps become normals: pd, simple or printed
     #[arg(long, default_value_t = BlendMode::PartialDerivatives)]
     pub blend: BlendMode,
+    /// What deforms the face: bones, or the mesh's own expression shapes where the frame has weights for them
+    #[arg(long, default_value_t = Deformation::Bones, value_name = "bones|shapes")]
+    pub deform: Deformation,
     /// Character file; the built-in one where none is given
     #[arg(long, value_name = "FILE.glb")]
     pub character: Option<PathBuf>,
@@ -171,7 +174,7 @@ impl Studio {
         camera.orbit(args.orbit[0].to_radians(), args.orbit[1].to_radians());
         camera.zoom(args.zoom);
         let view = ViewMode::parse(&args.view, &asset.character)?;
-        let settings = DrawSettings { view, blend: args.blend, ..DrawSettings::new(camera) };
+        let settings = DrawSettings { view, deform: args.deform, blend: args.blend, ..DrawSettings::new(camera) };
         let headless = Headless::new(&asset)?;
         tracing::info!(adapter = headless.adapter().name, "drawing");
         Ok(Self { asset, headless, settings, size: args.size })

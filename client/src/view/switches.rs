@@ -1,6 +1,6 @@
 //! What the person before the window has chosen.
 
-use crate::renderer::{BlendMode, Camera, DrawSettings, ViewMode};
+use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, ViewMode};
 use egui::{Key, Modifiers};
 use rhytid_shared::Character;
 
@@ -55,6 +55,12 @@ impl Switches {
         if pressed(Key::B) {
             let at = BlendMode::ALL.iter().position(|&mode| mode == self.draw.blend).unwrap_or(0);
             self.draw.blend = BlendMode::ALL[(at + 1) % BlendMode::ALL.len()];
+        }
+        if pressed(Key::D) {
+            self.draw.deform = match self.draw.deform {
+                Deformation::Bones => Deformation::Shapes,
+                Deformation::Shapes => Deformation::Bones,
+            };
         }
         if pressed(Key::H) {
             self.has_panel = !self.has_panel;
@@ -183,7 +189,8 @@ mod tests {
         for mode in [1, 2, 0].map(|at| BlendMode::ALL[at]) {
             assert_eq!(desk.press(Key::B).draw.blend, mode);
         }
-        for key in [Key::W, Key::H, Key::F] {
+        assert_eq!(desk.press(Key::D).draw.deform, Deformation::Shapes);
+        for key in [Key::W, Key::D, Key::H, Key::F] {
             desk.press(key);
         }
         assert_eq!(desk.switches, before, "pressed again they switch back");
