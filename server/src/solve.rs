@@ -10,6 +10,7 @@ mod config;
 mod depth;
 mod easing;
 mod error;
+mod estimate;
 mod evaluate;
 mod filter;
 mod gaze;
@@ -28,6 +29,7 @@ mod weights_to_bones;
 
 /// The stages by themselves: for benchmarks, and for whoever builds another pipeline of them.
 pub mod stages {
+    pub use super::estimate::{ExpressionMap, FitReport, ShapeFit};
     pub use super::evaluate::Evaluator;
     pub use super::filter::OneEuroBank;
     pub use super::head_pose::{Fit, Pose, lift, refine};

@@ -3,8 +3,8 @@
 mod solve_fixture;
 
 use rhytid_server::solve::{SolveConfig, Solver};
-use rhytid_shared::FaceFrame;
 use rhytid_shared::layout::Layout;
+use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame};
 use solve_fixture::{character, feed, hello, weight_frame};
 use std::alloc::{GlobalAlloc, Layout as MemoryLayout, System};
 use std::cell::Cell;
@@ -62,4 +62,24 @@ fn frames_allocate_nothing() {
         solver.solve(frame, &mut out).expect("a good frame");
     }
     assert_eq!(NUM_ALLOCATIONS.get(), before);
+}
+
+/// The fixture has no shapes that landmarks tell; the built-in character has.
+#[test]
+fn expression_weights_allocate_nothing() {
+    let character = std::sync::Arc::new(Character::from_glb(DEFAULT_CHARACTER_GLB).expect("the built-in character is sound"));
+    let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(Some(Layout::Ibug68), None)).expect("a good session");
+    let mut out = FaceFrame::at_rest(&character);
+    let frames = feed(&character, 100);
+    // The first neutral stands by then.
+    let (before, after) = frames.split_at(80);
+    for frame in before {
+        solver.solve(frame, &mut out).expect("a good frame");
+    }
+    let num = NUM_ALLOCATIONS.get();
+    for frame in after {
+        solver.solve(frame, &mut out).expect("a good frame");
+    }
+    assert!(out.shapes.is_some(), "weights are estimated");
+    assert_eq!(NUM_ALLOCATIONS.get(), num);
 }
