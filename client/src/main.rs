@@ -48,7 +48,9 @@ fn main() -> ExitCode {
 }
 
 fn run(cli: Cli) -> anyhow::Result<()> {
-    let level = ["error,rhytid=warn", "warn,rhytid=info", "warn,rhytid=debug"][usize::from(cli.verbose.min(2))];
+    // What a driver says of a failure the program tells in its own words.
+    let level =
+        ["error,wgpu_hal::vulkan::instance=off,rhytid=warn", "warn,rhytid=info", "warn,rhytid=debug"][usize::from(cli.verbose.min(2))];
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal()).init();
     match cli.command {

@@ -8,13 +8,15 @@ mod solve_fixture;
 
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use glam::{DVec2, DVec3, Vec3};
+use rhytid_server::pipeline::Pipeline;
 use rhytid_server::solve::stages::{Evaluator, ExpressionMap, OneEuroBank, Pose, Regression, lift, refine};
 use rhytid_server::solve::{SolveConfig, Solver};
-use rhytid_shared::layout::{IBUG_STABLE, Layout};
-use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame, TrackingFrame};
-use solve_fixture::{IMAGE, View, expression, feed, hello, landmarks, see, weight_frame};
+use rhytid_shared::layout::{IBUG_FROM_MEDIAPIPE, IBUG_STABLE, Layout};
+use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame, TrackingData, TrackingFrame};
+use solve_fixture::{IMAGE, View, expression, feed, hello, landmark_frame, landmarks, see, weight_frame};
 use std::hint::black_box;
 use std::sync::Arc;
+use std::time::Instant;
 
 fn character() -> Arc<Character> {
     Arc::new(Character::from_glb(DEFAULT_CHARACTER_GLB).expect("the built-in character is sound"))
@@ -61,6 +63,61 @@ fn whole(criterion: &mut Criterion) {
     let named: Vec<(&str, f32)> = ["jawOpen", "mouthSmileLeft", "browInnerUp", "eyeBlinkLeft"].map(|name| (name, 0.4)).into();
     let mut frames = Endless { frames: vec![weight_frame(0.0, &named), weight_frame(0.0, &[])], next: 0, t: 0.0 };
     criterion.bench_function("whole frame of weights", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
+}
+
+/// The other things a frame may be: 478 points (ingest is what they cost more), bones, and no face.
+fn others(criterion: &mut Criterion) {
+    let character = character();
+    let mut out = FaceFrame::at_rest(&character);
+    let wide = feed(&character, 900).into_iter().map(|frame| {
+        let TrackingData::Landmarks { points, .. } = &frame.data else { return frame };
+        let mut wide = vec![[IMAGE[0] / 2.0, IMAGE[1] / 2.0, 0.0]; 478];
+        for (ibug, &at) in IBUG_FROM_MEDIAPIPE.iter().enumerate() {
+            wide[at] = points[ibug];
+        }
+        for (iris, corners) in [(468, [36, 39]), (473, [42, 45])] {
+            wide[iris] = [0, 1, 2].map(|axis| 0.5 * (points[corners[0]][axis] + points[corners[1]][axis]));
+        }
+        landmark_frame(frame.t, wide)
+    });
+    let mut frames = Endless { frames: wide.collect(), next: 0, t: 0.0 };
+    let hello_of = |layout| hello(layout, None);
+    let mut solver =
+        Solver::new(character.clone(), &SolveConfig::default(), &hello_of(Some(Layout::Mediapipe478))).expect("a good session");
+    for _ in 0..3000 {
+        solver.solve(frames.next(), &mut out).expect("a good frame");
+    }
+    criterion.bench_function("whole frame of 478 points", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
+
+    let bones = character.bones.iter().enumerate().map(|(i, bone)| (i, bone.rest + Vec3::splat(0.002))).collect();
+    let frame = TrackingFrame { t: 0.0, data: TrackingData::Bones { points: bones, head: None } };
+    let mut frames = Endless { frames: vec![frame], next: 0, t: 0.0 };
+    let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello_of(None)).expect("a good session");
+    // Easing, the skeleton and the evaluation: what every frame pays whatever it comes as.
+    criterion.bench_function("whole frame of bones", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
+
+    let mut frames = Endless { frames: vec![TrackingFrame { t: 0.0, data: TrackingData::NoFace }], next: 0, t: 1e6 };
+    criterion.bench_function("whole frame without a face", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
+}
+
+/// Every part of the way in one figure, beside its budget.
+fn total(_: &mut Criterion) {
+    let character = character();
+    let mut pipeline =
+        Pipeline::new(character.clone(), &SolveConfig::default(), &hello(Some(Layout::Ibug68), None), 1).expect("a good session");
+    let mut frames = Endless { frames: feed(&character, 900), next: 0, t: 0.0 };
+    let mut packet = Vec::new();
+    let mut run = |num: u32| {
+        let started = Instant::now();
+        for _ in 0..num {
+            pipeline.frame(frames.next(), &mut packet).expect("a good frame");
+        }
+        started.elapsed() / num
+    };
+    run(3000);
+    // The least of several runs: what the machine does besides only adds.
+    let least = (0..20).map(|_| run(1000)).min().unwrap_or_default();
+    println!("total, landmarks to packet: {:.2} microseconds a frame (budget of the solve: 10)", least.as_secs_f64() * 1e6);
 }
 
 /// The budget of a new neutral is 5 ms.
@@ -138,5 +195,5 @@ fn stages(criterion: &mut Criterion) {
         .bench_function("evaluate all bones x 4 poses", |bencher| bencher.iter(|| evaluator.evaluate(black_box(&points), &mut influences)));
 }
 
-criterion_group!(benches, whole, calibration, stages);
+criterion_group!(benches, whole, others, calibration, stages, total);
 criterion_main!(benches);

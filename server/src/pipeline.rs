@@ -1,7 +1,7 @@
 //! One publish session's way from tracking frames to packets: the solve, then the encoder. No clock, no I/O: the packets
 //! depend on the feed alone, so the same feed gives the same bytes at any speed.
 
-use crate::solve::{CalibrationReport, DelayReport, SolveConfig, SolveError, Solver};
+use crate::solve::{Calibration, CalibrationReport, DelayReport, SolveConfig, SolveError, Solver};
 use rhytid_shared::packet::{Encoder, PacketKind};
 use rhytid_shared::{Character, FaceFrame, PublishHello, TrackingFrame};
 use std::sync::Arc;
@@ -18,13 +18,22 @@ pub struct Pipeline {
 impl Pipeline {
     /// Starts session number `session` (from 1) of a room.
     pub fn new(character: Arc<Character>, config: &SolveConfig, hello: &PublishHello, session: u32) -> Result<Self, SolveError> {
-        Ok(Self {
-            encoder: Encoder::new(&*character),
-            face: FaceFrame::at_rest(&character),
-            solver: Solver::new(character, config, hello)?,
-            session,
-            num_frames: 0,
-        })
+        Ok(Self::of(Solver::new(Arc::clone(&character), config, hello)?, &character, session))
+    }
+
+    /// As [`Self::new`], with the neutral of an earlier session (see [`Self::calibration`]) in place of the search for one.
+    pub fn with_calibration(
+        character: Arc<Character>,
+        config: &SolveConfig,
+        hello: &PublishHello,
+        session: u32,
+        calibration: Calibration,
+    ) -> Result<Self, SolveError> {
+        Ok(Self::of(Solver::with_calibration(Arc::clone(&character), config, hello, calibration)?, &character, session))
+    }
+
+    fn of(solver: Solver, character: &Character, session: u32) -> Self {
+        Self { encoder: Encoder::new(character), face: FaceFrame::at_rest(character), solver, session, num_frames: 0 }
     }
 
     /// Numbers the session, where its number is known only after the pipeline stands.
@@ -61,6 +70,11 @@ impl Pipeline {
     /// A neutral that has been reached since the last call.
     pub fn take_calibrated(&mut self) -> Option<CalibrationReport> {
         self.solver.take_calibrated()
+    }
+
+    /// The neutral in use, once one has been reached: kept with a session, a part of it can be replayed exactly.
+    pub fn calibration(&self) -> Option<&Calibration> {
+        self.solver.calibration()
     }
 
     /// What the smoothing adds now.

@@ -5,6 +5,8 @@
 //! correctives, or an animator's own bones) → each bone's motion → eased over lost faces and new neutrals → evaluated
 //! points, rotations and influences.
 
+#![deny(clippy::disallowed_methods)]
+
 mod calibration;
 mod config;
 mod depth;
@@ -20,6 +22,7 @@ mod landmark_session;
 mod landmarks_to_bones;
 mod lids;
 mod linear;
+mod lower_face;
 mod points;
 mod rbf;
 mod rotation;
@@ -49,6 +52,9 @@ use serde::Serialize;
 use skeleton::Skeleton;
 use std::sync::Arc;
 use weight_session::{SentHead, WeightSession};
+
+/// Frames nearer to each other than a packet's clock can tell, seconds, are one.
+const SHORTEST_STEP: f64 = 1e-6;
 
 /// What a publisher is told when a neutral has been reached.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -145,7 +151,7 @@ impl Solver {
     ) -> Result<Self, SolveError> {
         let mut solver = Self::new(character, config, hello)?;
         let num_points = solver.landmarks.as_ref().map_or(0, LandmarkSession::num_points);
-        if let Some(problem) = calibration.problem(num_points) {
+        if let Some(problem) = calibration.problem(num_points, solver.character.head_pivot.as_dvec3()) {
             return Err(SolveError::BadCalibration { problem });
         }
         match &mut solver.landmarks {
@@ -159,22 +165,21 @@ impl Solver {
         Ok(solver)
     }
 
-    /// Takes the neutral now: the face of the last moments or, before any face, of the first ones to come.
+    /// Takes the neutral now: the face of the last moments or, before any face, of the first ones to come, whatever they come
+    /// as.
     pub fn calibrate(&mut self) {
-        let landmarks = match self.last_source {
-            Some(Source::Landmarks) | None => self.landmarks.as_mut(),
-            Some(Source::Weights | Source::Bones) => None,
-        };
-        if let Some(landmarks) = landmarks {
-            if landmarks.calibrate(&self.character, self.last_t) {
-                self.blend = Some(self.config.calibration.blend);
-                self.report = landmarks.calibration().map(report_of);
-            }
-            return;
-        }
         self.is_wanted = true;
-        if let (Some(t), Some(_)) = (self.last_t, self.last_source) {
-            self.calibrate_sent(t);
+        match (self.last_t, self.last_source) {
+            (Some(t), Some(Source::Weights | Source::Bones)) => self.calibrate_sent(t),
+            _ => {
+                if let Some(landmarks) = &mut self.landmarks
+                    && landmarks.calibrate(&self.character, self.last_t)
+                {
+                    self.blend = Some(self.config.calibration.blend);
+                    self.report = landmarks.calibration().map(report_of);
+                    self.is_wanted = false;
+                }
+            }
         }
     }
 
@@ -187,6 +192,9 @@ impl Solver {
         self.sent_calibration = Some(calibration);
         self.blend = Some(self.config.calibration.blend);
         self.is_wanted = false;
+        if let Some(landmarks) = &mut self.landmarks {
+            landmarks.withdraw();
+        }
     }
 
     /// Solves one frame into `out`, whose buffers are reused; `session` is left to the caller, `seq` counts solved frames.
@@ -196,7 +204,7 @@ impl Solver {
         if !(0.0..=MAX_SECONDS).contains(&t) {
             return Err(SolveError::TimeRange { got: t });
         }
-        if let Some(previous) = self.last_t.filter(|previous| t <= *previous) {
+        if let Some(previous) = self.last_t.filter(|previous| t - previous < SHORTEST_STEP) {
             return Err(SolveError::Time { got: t, previous });
         }
         let source = self.aim(t, &frame.data)?;
@@ -204,6 +212,13 @@ impl Solver {
         out.face = source.is_some();
         match source {
             Some(source) => {
+                if self.last_source.is_some_and(|last| last != source) {
+                    // Another source sees another face: as with a new neutral, there is a way from one to the other.
+                    self.blend = Some(self.config.calibration.blend);
+                }
+                if self.easing.shown().is_placed != self.target.is_placed {
+                    self.easing.convert(|shown| self.skeleton.convert(shown, self.target.is_placed));
+                }
                 self.last_source = Some(source);
                 self.easing.show(t, &self.target, self.blend.take());
                 if self.is_wanted && source != Source::Landmarks {
@@ -236,6 +251,7 @@ impl Solver {
                 }
                 if solved.is_to_report {
                     self.report = landmarks.calibration().map(report_of);
+                    self.is_wanted &= !self.report.is_some_and(|report| report.requested);
                 }
                 Ok(Some(Source::Landmarks))
             }

@@ -35,10 +35,12 @@ impl Served {
         Self { child, address, stdout }
     }
 
+    /// A viewer's socket; `room` may have a query behind it.
     fn view(&self, room: &str) -> WebSocket<TcpStream> {
+        let (name, query) = room.split_at(room.find('?').unwrap_or(room.len()));
         let stream = TcpStream::connect(&self.address).expect("it listens");
         stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
-        tungstenite::client(format!("ws://{}/v1/rooms/{room}/view", self.address), stream).expect("it upgrades").0
+        tungstenite::client(format!("ws://{}/v1/rooms/{name}/view{query}", self.address), stream).expect("it upgrades").0
     }
 
     #[cfg(unix)]
@@ -236,9 +238,9 @@ fn a_closed_standard_output_is_no_end() {
     child.wait().unwrap();
 }
 
+/// Bytes of the server's memory that each of many viewers takes, once all have got frames.
 #[cfg(target_os = "linux")]
-#[test]
-fn a_viewer_takes_less_than_16_kib() {
+fn memory_of_viewers(query: &str) -> f64 {
     use rustix::process::{Resource, getrlimit, setrlimit};
     let mut limit = getrlimit(Resource::Nofile);
     limit.current = limit.maximum;
@@ -249,7 +251,7 @@ fn a_viewer_takes_less_than_16_kib() {
     let connect = |count: usize| -> Vec<WebSocket<TcpStream>> {
         (0..count)
             .map(|_| {
-                let mut viewer = served.view("demo");
+                let mut viewer = served.view(&format!("demo{query}"));
                 while !matches!(viewer.read().unwrap(), Message::Text(_)) {}
                 viewer.flush().unwrap();
                 viewer
@@ -277,9 +279,23 @@ fn a_viewer_takes_less_than_16_kib() {
         std::thread::sleep((start + Duration::from_millis(40) * i as u32).saturating_duration_since(Instant::now()));
     }
     for viewer in &mut viewers {
-        while !matches!(viewer.read().unwrap(), Message::Binary(_)) {}
+        while !matches!(viewer.read().unwrap(), Message::Binary(_) | Message::Text(_)) {}
     }
-    let bytes = (served.resident_kib() - before) as f64 * 1024.0 / most as f64;
-    println!("{most} viewers: {bytes:.0} bytes of memory each");
+    let bytes = served.resident_kib().saturating_sub(before) as f64 * 1024.0 / most as f64;
+    println!("{most} viewers{query}: {bytes:.0} bytes of memory each");
+    bytes
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_viewer_takes_less_than_16_kib() {
+    let bytes = memory_of_viewers("");
     assert!(bytes <= 16.0 * 1024.0, "{bytes} bytes a viewer");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_json_viewer_takes_less_than_32_kib() {
+    let bytes = memory_of_viewers("?format=json");
+    assert!(bytes <= 32.0 * 1024.0, "{bytes} bytes a viewer");
 }

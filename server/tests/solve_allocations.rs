@@ -2,10 +2,11 @@
 
 mod solve_fixture;
 
+use rhytid_server::pipeline::Pipeline;
 use rhytid_server::solve::{SolveConfig, Solver};
-use rhytid_shared::layout::Layout;
-use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame};
-use solve_fixture::{character, feed, hello, weight_frame};
+use rhytid_shared::layout::{IBUG_FROM_MEDIAPIPE, Layout};
+use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame, HeadPose, TrackingData, TrackingFrame};
+use solve_fixture::{character, feed, hello, landmark_frame, weight_frame};
 use std::alloc::{GlobalAlloc, Layout as MemoryLayout, System};
 use std::cell::Cell;
 
@@ -82,4 +83,61 @@ fn expression_weights_allocate_nothing() {
     }
     assert!(out.shapes.is_some(), "weights are estimated");
     assert_eq!(NUM_ALLOCATIONS.get(), num);
+}
+
+/// Frames that allocate after the first `num_first`, through the solve and the encoder.
+fn num_allocating(layout: Option<Layout>, frames: &[TrackingFrame], num_first: usize) -> usize {
+    let mut pipeline = Pipeline::new(character(), &SolveConfig::default(), &hello(layout, None), 1).expect("a good session");
+    // The largest packet there is fits.
+    let mut packet = Vec::with_capacity(4096);
+    let mut num_allocating = 0;
+    for (i, frame) in frames.iter().enumerate() {
+        let before = NUM_ALLOCATIONS.get();
+        pipeline.frame(frame, &mut packet).expect("a good frame");
+        num_allocating += usize::from(i >= num_first && NUM_ALLOCATIONS.get() > before);
+    }
+    num_allocating
+}
+
+#[test]
+fn packets_allocate_nothing_whatever_they_are_of() {
+    let character = character();
+    // From the third second on the first neutral is there; the next look is at five.
+    let landmarks = &feed(&character, 145)[..];
+    assert_eq!(num_allocating(Some(Layout::Ibug68), landmarks, 70), 0, "68 points");
+
+    let wide: Vec<TrackingFrame> = landmarks
+        .iter()
+        .map(|frame| {
+            let TrackingData::Landmarks { points, .. } = &frame.data else { panic!("landmarks") };
+            let mut wide = vec![[320.0, 240.0, 0.0]; 478];
+            for (ibug, &at) in IBUG_FROM_MEDIAPIPE.iter().enumerate() {
+                wide[at] = points[ibug];
+            }
+            for (iris, corners) in [(468, [36, 39]), (473, [42, 45])] {
+                wide[iris] = [0, 1, 2].map(|axis| 0.5 * (points[corners[0]][axis] + points[corners[1]][axis]));
+            }
+            landmark_frame(frame.t, wide)
+        })
+        .collect();
+    assert_eq!(num_allocating(Some(Layout::Mediapipe478), &wide, 70), 0, "478 points");
+
+    let lost: Vec<TrackingFrame> = landmarks
+        .iter()
+        .enumerate()
+        .map(|(i, frame)| if (80..120).contains(&i) { TrackingFrame { t: frame.t, data: TrackingData::NoFace } } else { frame.clone() })
+        .collect();
+    assert_eq!(num_allocating(Some(Layout::Ibug68), &lost, 70), 0, "a face lost and found");
+
+    let bones: Vec<TrackingFrame> = (0..100)
+        .map(|i| {
+            let points = vec![(0, character.bones[0].rest + glam::Vec3::Y * 1e-4 * i as f32), (23, character.bones[23].rest)];
+            let head = Some(HeadPose { rotation: glam::Quat::IDENTITY, position: glam::Vec3::X * 1e-3 * i as f32 });
+            TrackingFrame { t: f64::from(i) / 60.0, data: TrackingData::Bones { points, head } }
+        })
+        .collect();
+    assert_eq!(num_allocating(None, &bones, 1), 0, "bones");
+
+    let weights: Vec<TrackingFrame> = (0..100).map(|i| weight_frame(f64::from(i) / 60.0, &[("jawOpen", 0.01 * i as f32)])).collect();
+    assert_eq!(num_allocating(None, &weights, 1), 0, "weights");
 }

@@ -170,6 +170,52 @@ mod tests {
         {
             assert_eq!(ArkitShape::of_target(name).map(ArkitShape::name), want, "{name}");
         }
+        // All that the ICT FaceKit's head has: of 57 targets four are none of ARKit's, the rest makes all shapes but the tongue.
+        let sided = [
+            "PupilDilate",
+            "browDown",
+            "browInnerUp",
+            "browOuterUp",
+            "cheekPuff",
+            "cheekRaiser",
+            "cheekSquint",
+            "eyeBlink",
+            "eyeLookDown",
+            "eyeLookIn",
+            "eyeLookOut",
+            "eyeLookUp",
+            "eyeSquint",
+            "eyeWide",
+            "mouthDimple",
+            "mouthFrown",
+            "mouthLowerDown",
+            "mouthPress",
+            "mouthSmile",
+            "mouthStretch",
+            "mouthUpperUp",
+            "noseSneer",
+        ];
+        let whole = [
+            "jawForward",
+            "jawLeft",
+            "jawOpen",
+            "jawRight",
+            "mouthClose",
+            "mouthFunnel",
+            "mouthLeft",
+            "mouthPucker",
+            "mouthRight",
+            "mouthRollLower",
+            "mouthRollUpper",
+            "mouthShrugLower",
+            "mouthShrugUpper",
+        ];
+        let names = sided.iter().flat_map(|stem| [format!("{stem}_L"), format!("{stem}_R")]).chain(whole.map(str::to_owned));
+        let found: Vec<Option<ArkitShape>> = names.map(|name| ArkitShape::of_target(&name)).collect();
+        assert_eq!((found.len(), found.iter().filter(|shape| shape.is_none()).count()), (57, 4));
+        let distinct: std::collections::BTreeSet<ArkitShape> = found.into_iter().flatten().collect();
+        assert_eq!(distinct.len(), NUM_ARKIT_SHAPES - 1);
+        assert!(!distinct.iter().any(|shape| shape.name() == "tongueOut"));
         for name in ["", "_L", "PupilDilate_L", "cheekRaiser_R", "é_L"] {
             assert_eq!(ArkitShape::of_target(name), None, "{name}");
         }

@@ -7,7 +7,7 @@ mod setup;
 use anyhow::{Context, Result, ensure};
 use clap::{Parser, Subcommand};
 use std::path::PathBuf;
-use std::process::Command;
+use std::process::{Command, ExitCode};
 
 #[derive(Parser)]
 #[command(about = "Rhytid's developer commands")]
@@ -32,12 +32,19 @@ enum Task {
     Bake,
 }
 
-fn main() -> Result<()> {
-    match Arguments::parse().command {
+fn main() -> ExitCode {
+    let result = match Arguments::parse().command {
         Task::Demo => demo::run(),
         Task::Test { arguments } => test(&arguments),
         Task::Setup => setup::run(),
         Task::Bake => bake::run(),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
     }
 }
 

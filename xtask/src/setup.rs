@@ -60,11 +60,20 @@ pub fn run() -> Result<()> {
     {
         println!("set-up: {error}");
     }
-    for need in missing.iter().filter(|need| !(need.is_here)()) {
-        println!("set-up: still without {}: {}.", need.what, need.without);
-        println!("        To get it: sudo apt-get install --no-install-recommends {}", need.packages.join(" "));
+    let missing: Vec<&Need> = missing.into_iter().filter(|need| !(need.is_here)()).collect();
+    for need in &missing {
+        println!("set-up: still without {}: {}", need.what, need.without);
+    }
+    if !missing.is_empty() {
+        println!("set-up: to get all of it: {}", command_for(&missing));
     }
     Ok(())
+}
+
+/// The one command that installs all that is missing.
+fn command_for(missing: &[&Need]) -> String {
+    let packages: Vec<&str> = missing.iter().flat_map(|need| need.packages.iter().copied()).collect();
+    format!("sudo apt-get install --no-install-recommends {}", packages.join(" "))
 }
 
 /// A display a window can open on.
@@ -118,4 +127,18 @@ fn has_library(name: &str) -> bool {
         .iter()
         .find_map(|program| Command::new(program).arg("-p").output().ok())
         .is_some_and(|output| String::from_utf8_lossy(&output.stdout).lines().any(|line| line.trim_start().starts_with(name)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_command_installs_all_that_is_missing() {
+        let [driver, _, display] = &NEEDS;
+        assert_eq!(
+            command_for(&[driver, display]),
+            "sudo apt-get install --no-install-recommends libvulkan1 mesa-vulkan-drivers xvfb xauth"
+        );
+    }
 }

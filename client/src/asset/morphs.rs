@@ -257,6 +257,16 @@ mod tests {
     }
 
     #[test]
+    fn built_in_character_takes_a_sixth_of_the_largest_texture() {
+        let asset = crate::CharacterAsset::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap();
+        let morphs = &asset.morphs;
+        let most = asset.primitives.iter().flat_map(|p| &p.vertices).map(|vertex| vertex.morphs[1]).max();
+        println!("{} entries, {} bytes, at most {most:?} a vertex", morphs.num_entries(), morphs.texels.len() * 8);
+        assert!(morphs.num_entries() > 100_000 && morphs.num_entries() < MAX_ENTRIES / 5, "{}", morphs.num_entries());
+        assert!(most.is_some_and(|most| most as usize <= rhytid_shared::NUM_ARKIT_SHAPES));
+    }
+
+    #[test]
     fn texture_fits_what_webgl2_guarantees_up_to_the_last_entry_and_one_more_is_refused() {
         let full = Morphs { texels: vec![[f16::ZERO; 4]; MAX_ENTRIES * TEXELS_PER_ENTRY] };
         assert_eq!(full.texture_size(), [2046, 2048]);

@@ -33,6 +33,9 @@ pub enum RenderError {
         /// What was asked for.
         got: [u32; 2],
     },
+    /// A mistake in what was drawn.
+    #[error("the GPU device refuses the picture: {0}")]
+    Invalid(String),
     /// The device was lost.
     #[error("reading the picture back failed: {0}")]
     ReadBack(String),
@@ -84,12 +87,16 @@ impl Headless {
 
     /// Draws one picture and waits for it.
     pub fn render(&mut self, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> Result<RgbaImage, RenderError> {
-        // Without a scope wgpu's own handler would end the program.
-        let scope = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+        // Without scopes wgpu's own handler would end the program. What uses a texture there was no memory for is invalid, too.
+        let consequences = self.device.push_error_scope(wgpu::ErrorFilter::Validation);
+        let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let target = self.target(size)?;
         let encoder = self.record(&target, size, settings, frame);
-        if pollster::block_on(scope.pop()).is_some() {
+        if pollster::block_on(memory.pop()).is_some() {
             return Err(RenderError::OutOfMemory { got: size });
+        }
+        if let Some(error) = pollster::block_on(consequences.pop()) {
+            return Err(RenderError::Invalid(error.to_string()));
         }
         read_back(&self.device, &self.queue, encoder, &target, size)
     }

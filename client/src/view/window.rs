@@ -194,10 +194,15 @@ impl GpuWindow {
             }
             wgpu::CurrentSurfaceTexture::Timeout => Ok(Canvas::Again),
             wgpu::CurrentSurfaceTexture::Occluded => Ok(Canvas::Hidden),
-            // A device that was just lost shows here first.
-            wgpu::CurrentSurfaceTexture::Validation if self.is_lost.load(Ordering::SeqCst) => Ok(Canvas::DeviceLost),
+            wgpu::CurrentSurfaceTexture::Validation if self.is_just_lost() => Ok(Canvas::DeviceLost),
             wgpu::CurrentSurfaceTexture::Validation => Err(WindowError::Surface("the surface gave no picture to draw into".into())),
         }
+    }
+
+    /// A device that is lost between two pictures gives no canvas first, and says why when it is asked for its news.
+    fn is_just_lost(&self) -> bool {
+        let news = self.device.poll(wgpu::PollType::Poll);
+        news.is_err() || self.is_lost.load(Ordering::SeqCst)
     }
 
     /// Lays out and draws one picture of the window into `canvas`, and shows it.

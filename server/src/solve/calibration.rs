@@ -23,6 +23,8 @@ const RECENT: usize = 16;
 const MOST_WORKED: usize = 96;
 /// A neutral that is asked for is taken from at least this many frames; it waits for them.
 const FEWEST_ASKED: usize = 3;
+/// A face has no point farther than this from the origin of head space, metres.
+const FARTHEST: f64 = 1.0;
 /// When the session is looked at again, seconds of a face seen.
 const LOOKS: [f64; 5] = [5.0, 10.0, 20.0, 40.0, 80.0];
 
@@ -63,8 +65,8 @@ impl Calibration {
         }
     }
 
-    /// Why this cannot be the calibration of a session with `num_points` points, if so.
-    pub(super) fn problem(&self, num_points: usize) -> Option<String> {
+    /// Why this cannot be the calibration of a session with `num_points` points, if so. `pivot` is the character's head's.
+    pub(super) fn problem(&self, num_points: usize, pivot: DVec3) -> Option<String> {
         if !self.points.is_empty() && self.points.len() != num_points {
             return Some(format!("has {} points, expected {num_points}", self.points.len()));
         }
@@ -73,8 +75,18 @@ impl Calibration {
         }
         let numbers = self.points.iter().flatten().chain(&self.head_rotation).chain(&self.head_position);
         let are_finite = numbers.copied().all(f64::is_finite) && self.weights.iter().flatten().all(|weight| weight.is_finite());
-        let norm = DQuat::from_array(self.head_rotation).length();
-        (!are_finite || (norm - 1.0).abs() > 1e-3).then(|| "holds values that are not finite or a rotation that is none".to_owned())
+        let rotation = DQuat::from_array(self.head_rotation);
+        if !are_finite || (rotation.length() - 1.0).abs() > 1e-3 {
+            return Some("holds values that are not finite or a rotation that is none".to_owned());
+        }
+        if let Some(i) = self.points.iter().position(|point| point.iter().any(|value| value.abs() > FARTHEST)) {
+            return Some(format!("has points[{i}] at {:?}, expected within ±{FARTHEST} m of the origin of head space", self.points[i]));
+        }
+        let pose = Pose { rotation, translation: DVec3::from(self.head_position) - rotation::rotate(rotation, pivot) };
+        let matrix = pose.matrix();
+        let is_before = |point: &[f64; 3]| (matrix * DVec3::from(*point) + pose.translation).z > 0.0;
+        (!self.points.iter().all(is_before))
+            .then(|| format!("has the head at {:?}, expected all of it before the camera", self.head_position))
     }
 }
 
@@ -153,6 +165,8 @@ pub(super) struct Calibrator {
     is_automatic: bool,
     has_neutral: bool,
     wanted: Option<Wanted>,
+    /// Not before this time is looked again: the frames at hand gave no neutral.
+    next_try: f64,
 }
 
 /// A neutral that the publisher waits for.
@@ -190,6 +204,7 @@ impl Calibrator {
             is_automatic: true,
             has_neutral: false,
             wanted: None,
+            next_try: f64::NEG_INFINITY,
         }
     }
 
@@ -249,16 +264,35 @@ impl Calibrator {
     }
 
     /// The publisher asks for the neutral now. Given at once where frames of the last moments are there, else as soon as
-    /// they are.
-    pub(super) fn request(&mut self, t: f64, shape: &mut Shape<'_>) -> Option<Calibration> {
-        let found = self.look_back(t, FEWEST_ASKED, shape);
-        if found.is_none() {
-            self.wanted = Some(Wanted { since: None });
-        }
-        found
+    /// they are: it is owed until [`Self::accepted`].
+    pub(super) fn request(&mut self, t: f64, shape: &mut Shape<'_>) -> Option<Found> {
+        self.wanted = Some(Wanted { since: None });
+        self.look_back(t, FEWEST_ASKED, shape)
     }
 
-    fn look_back(&mut self, t: f64, fewest: usize, shape: &mut Shape<'_>) -> Option<Calibration> {
+    /// Nobody waits for a neutral any more.
+    pub(super) fn withdraw(&mut self) {
+        self.wanted = None;
+    }
+
+    /// The neutral that was given is in use.
+    pub(super) fn accepted(&mut self, is_requested: bool) {
+        self.has_neutral = true;
+        if is_requested {
+            self.is_automatic = false;
+            self.wanted = None;
+        }
+    }
+
+    /// The neutral that was given at `t` was none: another is looked for among the frames to come.
+    pub(super) fn refused(&mut self, t: f64, is_requested: bool) {
+        self.next_try = t + self.config.look_back;
+        if is_requested {
+            self.wanted = Some(Wanted { since: None });
+        }
+    }
+
+    fn look_back(&self, t: f64, fewest: usize, shape: &mut Shape<'_>) -> Option<Found> {
         let since = t - self.config.look_back;
         let samples = &self.recent.samples;
         let recent: Vec<usize> = (0..samples.len()).filter(|&i| samples[i].t >= since).collect();
@@ -267,18 +301,21 @@ impl Calibrator {
         }
         let mut calibration = median_of(&self.recent, &calmest_half(samples, recent), shape, t)?;
         calibration.requested = true;
-        (self.is_automatic, self.has_neutral) = (false, true);
-        self.wanted = None;
-        Some(calibration)
+        Some(Found { calibration, is_awaited: true })
     }
 
-    /// A neutral that has just been reached. Call once a frame, after [`Self::observe`]. `current` is the neutral in use.
+    /// A neutral that has just been reached, to be answered by [`Self::accepted`] or [`Self::refused`]. Call once a frame,
+    /// after [`Self::observe`]. `current` is the neutral in use.
     pub(super) fn poll(&mut self, t: f64, shape: &mut Shape<'_>, current: &Calibration) -> Option<Found> {
         if let Some(Wanted { since: Some(since) }) = self.wanted
             && t - since >= self.config.look_back
         {
             // A slow tracker has no more frames than these.
-            return self.look_back(t, 1, shape).map(|calibration| Found { calibration, is_awaited: true });
+            let found = self.look_back(t, 1, shape);
+            if found.is_none() {
+                self.refused(t, true);
+            }
+            return found;
         }
         let elapsed = t - self.started_at? - self.lost_for;
         let is_due = if self.has_neutral {
@@ -286,7 +323,7 @@ impl Calibrator {
         } else {
             elapsed >= self.config.patience || self.num_calm >= self.config.min_frames
         };
-        if !is_due {
+        if !is_due || t < self.next_try {
             return None;
         }
         let is_awaited = !self.has_neutral;
@@ -296,7 +333,6 @@ impl Calibrator {
         let stride = relaxed.len().div_ceil(MOST_WORKED).max(1);
         let worked = relaxed.iter().step_by(stride).map(|&i| (self.history.samples[i].pose, self.history.rays_of(i)));
         depth::refine(shape, worked);
-        self.has_neutral = true;
         if !self.is_automatic {
             return Some(Found { calibration: with_depth(current, shape, t), is_awaited });
         }
@@ -304,7 +340,11 @@ impl Calibrator {
         let calm: Vec<usize> = (0..samples.len()).filter(|&i| samples[i].speed < self.config.calm_speed).collect();
         let calm = if calm.len() >= self.config.min_frames { calm } else { calmest_half(samples, (0..samples.len()).collect()) };
         let chosen = if self.strain.is_some() { least_strained_half(samples, calm) } else { calm };
-        median_of(&self.history, &chosen, shape, t).map(|calibration| Found { calibration, is_awaited })
+        let found = median_of(&self.history, &chosen, shape, t).map(|calibration| Found { calibration, is_awaited });
+        if found.is_none() {
+            self.refused(t, false);
+        }
+        found
     }
 }
 
@@ -419,4 +459,78 @@ pub(super) fn ibug_strain(points: &[DVec2]) -> f64 {
     let openness = (opening(37, 41) + opening(38, 40) + opening(43, 47) + opening(44, 46)) / (2.0 * eye_width);
     let shut = (0.2 - openness).max(0.0);
     (gap + (width - 0.56 * unit).abs() + 0.5 * corner_height.abs()) / unit + shut
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NUM_POINTS: usize = 6;
+    const UNIT: f64 = 0.09;
+
+    /// A face that is never calm: all of it goes to and fro, quickly in its first `num_quick` frames at 30 a second. Gives when a
+    /// neutral was found and what it is.
+    fn find(num_quick: usize, accepts: bool) -> (Vec<f64>, Option<Calibration>) {
+        let mut model: Vec<DVec3> = (0..NUM_POINTS).map(|i| DVec3::new(0.02 * i as f64, 0.01 * (i % 3) as f64, 0.0)).collect();
+        let prior = [0.0; NUM_POINTS];
+        let spread = [0.1; NUM_POINTS];
+        let mirror: Vec<usize> = (0..NUM_POINTS).collect();
+        let mut calibrator = Calibrator::new(&CalibrationConfig::default(), NUM_POINTS, None);
+        let pose = Pose { rotation: DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0), translation: DVec3::new(0.0, 0.0, 0.6) };
+        let current = provisional(0.0, &[DVec2::ZERO; NUM_POINTS], &model, &pose, DVec3::ZERO);
+        let (mut times, mut found) = (Vec::new(), None);
+        for frame in 0..90 {
+            let t = f64::from(frame) / 30.0;
+            // 0.5 or 0.15 interocular distances a second; the quick ones are somewhere else, too.
+            let is_quick = (frame as usize) < num_quick;
+            let (swing, place) = if is_quick { (0.5 / 30.0 * UNIT, 0.01) } else { (0.15 / 30.0 * UNIT, 0.0) };
+            let off = DVec2::new(place + if frame % 2 == 0 { 0.5 } else { -0.5 } * swing, 0.0);
+            let points: Vec<DVec2> = model.iter().map(|point| point.truncate() + off).collect();
+            let rays: Vec<DVec2> = points.iter().map(|p| head_pose::project(&pose.matrix(), pose.translation, p.extend(0.0))).collect();
+            calibrator.observe(t, &rays, &pose, &points, UNIT);
+            let mut shape = Shape {
+                model: &mut model,
+                prior: &prior,
+                believed_spread: &spread,
+                mirror: &mirror,
+                irises: &[],
+                stable: &[],
+                has_perspective: false,
+                unit: UNIT,
+                pivot: DVec3::ZERO,
+            };
+            if let Some(Found { calibration, is_awaited }) = calibrator.poll(t, &mut shape, &current) {
+                assert!(is_awaited);
+                times.push(t);
+                found = Some(calibration);
+                if accepts {
+                    calibrator.accepted(false);
+                } else {
+                    calibrator.refused(t, false);
+                }
+            }
+        }
+        (times, found)
+    }
+
+    #[test]
+    fn who_is_never_calm_is_taken_at_their_calmest_after_two_seconds() {
+        let (times, found) = find(25, true);
+        assert_eq!(times, [2.0]);
+        let found = found.expect("a neutral");
+        // Half of the 61 frames so far, all of them from the slower ones.
+        assert_eq!(found.num_frames, 31);
+        assert!((found.speed - 0.15).abs() < 0.01, "{}", found.speed);
+        assert!(found.points[0][0].abs() < 3e-4, "{:?}", found.points[0]);
+    }
+
+    #[test]
+    fn a_neutral_that_cannot_be_used_is_looked_for_again() {
+        let (times, _) = find(25, false);
+        assert!(times.len() >= 3, "{times:?}");
+        assert!(
+            times.windows(2).all(|pair| pair[1] - pair[0] > 0.999 * CalibrationConfig::default().look_back),
+            "not with every frame: {times:?}"
+        );
+    }
 }

@@ -111,6 +111,9 @@ impl Default for FilterConfig {
 
 impl Default for CalibrationConfig {
     fn default() -> Self {
+        // Two performers at a webcam, one making faces and one talking: the median of their speeds is 0.064 and 0.052, the lowest
+        // quarter below 0.030 and 0.026. Below 0.05 are 41 and 48 % of all frames, and 34 and 8 of the first 50: one is calm at
+        // once, the other has to be waited for.
         Self { calm_speed: 0.05, min_frames: 30, patience: 2.0, blend: 0.5, look_back: 0.4 }
     }
 }

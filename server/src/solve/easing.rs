@@ -8,7 +8,8 @@ use rhytid_shared::NUM_ARKIT_SHAPES;
 /// Everything about a face that is eased: linear in each of its numbers.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct FaceState {
-    /// A displacement in metres, or pitch and yaw in radians for bones that turn.
+    /// A displacement in metres; for bones that turn pitch and yaw in radians, and how much longer their arm is than at rest
+    /// (a fraction; 0 but on the way from placed bones).
     pub(super) motions: Vec<Vec3>,
     /// Rotation vector, then position in metres.
     pub(super) head: [f64; 6],
@@ -34,7 +35,7 @@ impl FaceState {
         self.is_placed = a.is_placed;
     }
 
-    /// `self += b * share`; weights only where both have them.
+    /// `self += b * share`; weights that one of them lacks count as zero.
     fn add_scaled(&mut self, b: &Self, share: f64) {
         for (to, from) in self.motions.iter_mut().zip(&b.motions) {
             *to += *from * share as f32;
@@ -42,7 +43,8 @@ impl FaceState {
         for axis in 0..6 {
             self.head[axis] += b.head[axis] * share;
         }
-        if let (Some(to), Some(from)) = (&mut self.weights, &b.weights) {
+        if let Some(from) = &b.weights {
+            let to = self.weights.get_or_insert([0.0; NUM_ARKIT_SHAPES]);
             for shape in 0..NUM_ARKIT_SHAPES {
                 to[shape] += from[shape] * share as f32;
             }
@@ -89,15 +91,21 @@ impl Easing {
         &self.shown
     }
 
-    /// Shows `target` at `t`. `blend` asks for a smooth way from what is shown now over that many seconds.
+    /// Says what is shown in the other way, before a face of another kind is shown.
+    pub(super) fn convert(&mut self, convert: impl Fn(&mut FaceState)) {
+        convert(&mut self.shown);
+        // A blend under way goes on in the new kind only from what is shown: the next one starts there.
+        self.blend = None;
+    }
+
+    /// Shows `target` at `t`, of the kind that is shown. `blend` asks for a smooth way from what is shown now over that many
+    /// seconds.
     pub(super) fn show(&mut self, t: f64, target: &FaceState, blend: Option<f64>) {
         let returns = matches!(self.presence, Presence::Lost(_)).then_some(self.config.return_blend);
         if let Some(duration) = [blend, returns].into_iter().flatten().reduce(f64::max) {
-            // Angles and displacements have no way between them.
-            let can_blend = target.is_placed == self.shown.is_placed;
             self.offset.copy_scaled(&self.shown, 1.0);
             self.offset.add_scaled(target, -1.0);
-            self.blend = (can_blend && duration > 0.0).then_some(Blend { from: t, duration });
+            self.blend = (duration > 0.0).then_some(Blend { from: t, duration });
         }
         self.presence = Presence::Seen;
         self.shown.copy_scaled(target, 1.0);

@@ -43,11 +43,21 @@ pub enum SolveError {
         /// Its value.
         got: f32,
     },
+    /// No lens has such a focal length.
+    #[error("hello.focal is {got}, expected {least} to {most} pixels, a tenth to fifty times the picture's width")]
+    FocalRange {
+        /// Its value.
+        got: f32,
+        /// Shortest, pixels.
+        least: f32,
+        /// Longest, pixels.
+        most: f32,
+    },
     /// Landmarks in a session whose hello named no layout.
     #[error("frame has landmarks, but hello.layout is missing")]
     NoLayout,
-    /// Time stood still or went back.
-    #[error("t is {got} s, expected more than the frame before it, {previous} s")]
+    /// Time stood still, went back, or on by less than a packet can tell.
+    #[error("t is {got} s, expected a microsecond or more after the frame before it, {previous} s")]
     Time {
         /// The frame's time.
         got: f64,

@@ -6,6 +6,9 @@ use std::f64::consts::TAU;
 /// A longer pause than this, seconds, starts the filter anew: nothing is known of what lay between.
 pub(super) const LONGEST_GAP: f64 = 0.25;
 
+/// Steps shorter than this, seconds, are none: a speed over them has no digits left.
+const SHORTEST_STEP: f64 = 1e-9;
+
 /// Share of the new sample for a cut-off in Hz and a step in seconds.
 fn alpha(cutoff: f64, dt: f64) -> f64 {
     let k = TAU * cutoff * dt;
@@ -52,7 +55,8 @@ impl OneEuroBank {
             self.mean_cutoff = self.config.min_cutoff;
             return &self.values;
         }
-        if dt <= 0.0 {
+        // Nor is a NaN a step.
+        if dt.is_nan() || dt < SHORTEST_STEP {
             return &self.values;
         }
         let speed_share = alpha(self.config.derivative_cutoff, dt);
@@ -119,6 +123,18 @@ mod tests {
         assert!((alpha(1.7, 1.0 / 30.0) - 0.2625625243).abs() < 1e-9);
         let bank = OneEuroBank::new(OneEuroConfig { min_cutoff: 1.0, beta: 0.0, derivative_cutoff: 1.0 }, 1, 1.0);
         assert!((bank.delay() - 0.1591549431).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_step_of_no_length_changes_nothing() {
+        let config = OneEuroConfig { min_cutoff: 3.0, beta: 10.0, derivative_cutoff: 1.0 };
+        let mut bank = OneEuroBank::new(config, 2, 1.0);
+        bank.update(&[0.0, 0.5], f64::INFINITY);
+        for dt in [5e-324, 1e-320, 0.0, -1.0, f64::NAN] {
+            assert_eq!(bank.update(&[0.0, 1.0], dt), [0.0, 0.5], "{dt}");
+        }
+        let after = bank.update(&[0.0, 1.0], 0.03);
+        assert!(after[0] == 0.0 && after[1] > 0.5 && after[1] < 1.0, "{after:?}");
     }
 
     #[test]

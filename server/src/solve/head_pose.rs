@@ -18,8 +18,11 @@ const SMALL_STEP: f64 = 5e-5;
 const SOFT_RESIDUAL: f64 = 0.02;
 /// The cosine below which a plane of the face is seen too much from the side for a ray to meet it surely: 70 degrees.
 const LEAST_FACING: f64 = 0.35;
-/// Points that spread less than this along a ray (root mean square) are no face: 0.03 degrees.
-const LEAST_SPREAD: f64 = 5e-4;
+/// Rays that spread less than this (root mean square) are one ray.
+const LEAST_SPREAD: f64 = 1e-9;
+/// Points whose spread across their longest extent is below this fraction of the interocular distance (root mean square)
+/// lie on a line, about which a head could turn unseen: the bridge of a nose does, a whole nose does not.
+const LEAST_WIDTH: f64 = 0.05;
 
 /// Rigid pose, `camera_from_head`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -91,18 +94,49 @@ pub fn lift(rotation: &DMat3, translation: DVec3, ray: DVec2, z: f64) -> DVec3 {
 
 /// As [`lift`], with the shift in x and y for each metre of depth.
 pub(super) fn lift_with_slope(rotation: &DMat3, translation: DVec3, ray: DVec2, z: f64) -> (DVec3, DVec2) {
-    let direction = rotation.transpose() * DVec3::new(ray.x, ray.y, 1.0);
-    (lift(rotation, translation, ray, z), DVec2::new(direction.x, direction.y) / direction.z.min(-LEAST_FACING))
+    (lift(rotation, translation, ray, z), slope(&rotation.transpose(), ray))
 }
 
-fn check_spread(rays: &[DVec2], weights: &[(usize, f64)]) -> Result<(), SolveError> {
+/// The shift in x and y of head space along a ray for each metre of depth.
+pub(super) fn slope(head_from_camera: &DMat3, ray: DVec2) -> DVec2 {
+    let direction = *head_from_camera * DVec3::new(ray.x, ray.y, 1.0);
+    DVec2::new(direction.x, direction.y) / direction.z.min(-LEAST_FACING)
+}
+
+/// True unless the weighted points lie (nearly) on one line, so that a pose can be found from them.
+pub(super) fn spans(model: &[DVec3], weights: &[(usize, f64)], unit: f64) -> bool {
+    let total: f64 = weights.iter().map(|&(_, weight)| weight).sum();
+    let mean = weights.iter().map(|&(i, weight)| model[i] * weight).sum::<DVec3>() / total;
+    let (mut xx, mut yy, mut zz, mut xy, mut yz, mut zx) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+    for &(i, weight) in weights {
+        let (d, share) = (model[i] - mean, weight / total);
+        xx += d.x * d.x * share;
+        yy += d.y * d.y * share;
+        zz += d.z * d.z * share;
+        xy += d.x * d.y * share;
+        yz += d.y * d.z * share;
+        zx += d.z * d.x * share;
+    }
+    // The principal minors sum to the eigenvalues' products in pairs: over the trace, nearly the second largest of them.
+    let pairs = (xx * yy - xy * xy) + (yy * zz - yz * yz) + (zz * xx - zx * zx);
+    let least = LEAST_WIDTH * unit;
+    weights.len() >= 4 && pairs > least * least * (xx + yy + zz)
+}
+
+/// Weighted root mean square distance of the rays from their mean.
+pub(super) fn spread(rays: &[DVec2], weights: &[(usize, f64)]) -> f64 {
     let total: f64 = weights.iter().map(|&(_, weight)| weight).sum();
     let mean = weights.iter().map(|&(i, weight)| rays[i] * weight).sum::<DVec2>() / total;
-    let spread = (weights.iter().map(|&(i, weight)| (rays[i] - mean).length_squared() * weight).sum::<f64>() / total).sqrt();
-    if spread.is_nan() || spread < LEAST_SPREAD {
-        return Err(SolveError::NoFaceShape { problem: "they lie in one place, expected a face of at least a few pixels" });
-    }
-    Ok(())
+    (weights.iter().map(|&(i, weight)| (rays[i] - mean).length_squared() * weight).sum::<f64>() / total).sqrt()
+}
+
+/// What is said of rays that are one.
+pub(super) const ONE_PLACE: SolveError =
+    SolveError::NoFaceShape { problem: "they lie in one place, expected a face of at least a few pixels" };
+
+fn check_spread(rays: &[DVec2], weights: &[(usize, f64)]) -> Result<(), SolveError> {
+    // A NaN is not above it.
+    if spread(rays, weights) > LEAST_SPREAD { Ok(()) } else { Err(ONE_PLACE) }
 }
 
 /// A rough pose from a similarity: a face seen from the front at the distance its size suggests.
@@ -143,6 +177,9 @@ pub fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weights: &[(
     };
     let mut damping = 1e-6;
     let mut system = System::at(&pose, model, rays, weights, f64::INFINITY, unit);
+    if system.nearest <= 0.0 {
+        return Err(SolveError::NoFaceShape { problem: "they are so large that the head would reach behind the camera" });
+    }
     for _ in 0..most_steps {
         let Some(step) = system.step(damping) else { break };
         let turn = rotation::from_vector(DVec3::new(step[0], step[1], step[2]));
@@ -152,7 +189,7 @@ pub fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weights: &[(
         let size = step[0].abs().max(step[1].abs()).max(step[2].abs())
             + step[3].abs().max(step[4].abs()).max(step[5].abs()) / pose.translation.z.abs();
         // The soft weights let a step raise the plain cost a little while it leaves an outlier behind.
-        if trial_system.cost <= system.cost * 1.05 + 1e-18 && trial.translation.z > 0.0 {
+        if trial_system.cost <= system.cost * 1.05 + 1e-18 && trial_system.nearest > 0.0 {
             (pose, system) = (trial, trial_system);
             damping = (damping * 0.1).max(1e-9);
             if size < SMALL_STEP {
@@ -165,11 +202,11 @@ pub fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weights: &[(
             }
         }
     }
-    let cost = system.cost;
-    if !(pose.translation.is_finite() && pose.rotation.is_finite()) {
+    let error = system.cost.sqrt() * pose.translation.z.abs() / unit;
+    if !(pose.translation.is_finite() && pose.rotation.is_finite() && error.is_finite()) {
         return Err(SolveError::NoFaceShape { problem: "no head pose fits them" });
     }
-    Ok(Fit { pose, error: cost.sqrt() * pose.translation.z / unit })
+    Ok(Fit { pose, error })
 }
 
 /// Normal equations of one Gauss–Newton step: rotation vector, then translation.
@@ -179,6 +216,8 @@ struct System {
     b: [f64; 6],
     /// Weighted mean square of the residuals, in rays.
     cost: f64,
+    /// Distance of the nearest point before the camera, metres.
+    nearest: f64,
 }
 
 impl System {
@@ -187,10 +226,12 @@ impl System {
         let matrix = pose.matrix();
         let soft = (SOFT_RESIDUAL * unit / pose.translation.z).max(2.0 * last_cost.sqrt());
         let per_soft_square = 1.0 / (soft * soft);
-        let (mut a, mut b, mut sum, mut total) = ([[0.0; 6]; 6], [0.0; 6], 0.0, 0.0);
+        let (mut a, mut b, mut sum, mut total, mut nearest) = ([[0.0; 6]; 6], [0.0; 6], 0.0, 0.0, f64::INFINITY);
         for &(i, weight) in weights {
             let turned = matrix * model[i];
             let p = turned + pose.translation;
+            // A NaN is carried on by the cost.
+            nearest = p.z.min(nearest);
             let per_z = 1.0 / p.z;
             let (x, y) = (p.x * per_z, p.y * per_z);
             let residual = rays[i] - DVec2::new(x, y);
@@ -211,7 +252,7 @@ impl System {
                 }
             }
         }
-        Self { a, b, cost: sum / total }
+        Self { a, b, cost: sum / total, nearest }
     }
 
     fn step(&self, damping: f64) -> Option<[f64; 6]> {

@@ -8,6 +8,10 @@ use rhytid_shared::layout::Layout;
 
 /// Landmarks may lie outside the picture, but not by more than this many of its sizes.
 const FARTHEST: f32 = 10.0;
+/// Focal lengths from the widest lens to the longest, in widths of the picture: 157 degrees to 1 degree across.
+const FOCAL_RANGE: [f32; 2] = [0.1, 50.0];
+/// Points that spread less than this (root mean square), pixels, are no face.
+const LEAST_SPREAD: f64 = 0.3;
 /// A landmark less sure than this is not believed: its last place serves.
 const LEAST_CONFIDENCE: f32 = 0.3;
 
@@ -43,8 +47,17 @@ impl Camera {
         if !(focal.is_finite() && focal > 0.0) {
             return Err(SolveError::BadCamera { field: "focal", got: focal });
         }
+        let [least, most] = FOCAL_RANGE.map(|widths| widths * image[0]);
+        if !(least..=most).contains(&focal) {
+            return Err(SolveError::FocalRange { got: focal, least, most });
+        }
         let centre = DVec2::new(f64::from(image[0]), f64::from(image[1])) * 0.5;
         Ok(Self { focal: f64::from(focal), centre, image, mirror })
+    }
+
+    /// Spread of rays (root mean square) below which they are no face.
+    pub(super) fn least_spread(&self) -> f64 {
+        LEAST_SPREAD / self.focal
     }
 
     fn ray(&self, pixel: [f32; 3]) -> DVec2 {

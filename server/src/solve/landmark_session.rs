@@ -11,6 +11,7 @@ use super::filter::{LONGEST_GAP, OneEuroBank};
 use super::head_pose::{self, Fit, Pose};
 use super::ingest::{Camera, Observation};
 use super::landmarks_to_bones::Retarget;
+use super::lower_face::LowerFace;
 use super::points::{Group, LEFT_EYE, PointSet, RIGHT_EYE};
 use super::rotation;
 use glam::{DQuat, DVec2, DVec3};
@@ -56,9 +57,11 @@ pub(super) struct LandmarkSession {
     pose: Option<Pose>,
     last_t: Option<f64>,
     refused_since: Option<f64>,
-    /// In head space, before and after smoothing.
+    /// In head space: as lifted, with mouth and chin settled, and smoothed. What is not believed stays where it was.
     lifted: Vec<DVec2>,
+    settled: Vec<DVec2>,
     smoothed: Vec<DVec2>,
+    lower_face: LowerFace,
     brows: GroupFilter,
     eyelids: GroupFilter,
     mouth: GroupFilter,
@@ -116,7 +119,10 @@ impl LandmarkSession {
             pose: None,
             last_t: None,
             refused_since: None,
-            lifted: vec![DVec2::ZERO; num],
+            // Until a point has been believed it is where the character has it.
+            lifted: model.iter().map(|point| point.truncate()).collect(),
+            settled: model.iter().map(|point| point.truncate()).collect(),
+            lower_face: LowerFace::new(points.lower.clone()),
             smoothed: vec![DVec2::ZERO; num],
             brows: group_filter(Group::Brows, config.filter.brows),
             eyelids: group_filter(Group::Eyelids, config.filter.eyelids),
@@ -145,6 +151,7 @@ impl LandmarkSession {
         for (lifted, model) in self.lifted.iter_mut().zip(&self.model) {
             *lifted = model.truncate();
         }
+        self.settled.copy_from_slice(&self.lifted);
         Ok(())
     }
 
@@ -156,12 +163,30 @@ impl LandmarkSession {
         self.calibration.as_ref().filter(|calibration| calibration.num_frames > 0)
     }
 
-    /// Asks for the neutral now; true where it is in use already.
+    /// Asks for the neutral now; true where it is in use already. Else it comes with one of the next frames.
     pub(super) fn calibrate(&mut self, character: &Character, t: Option<f64>) -> bool {
+        let t = t.unwrap_or(f64::NEG_INFINITY);
         let (calibrator, mut shape) = self.parts();
-        let Some(found) = calibrator.request(t.unwrap_or(f64::NEG_INFINITY), &mut shape) else { return false };
-        // A face that spans no plane is no neutral: the one in use stays.
-        self.adopt(character, found).is_ok()
+        let found = calibrator.request(t, &mut shape);
+        found.is_some_and(|found| self.try_neutral(character, t, found))
+    }
+
+    /// Nobody waits for a neutral any more.
+    pub(super) fn withdraw(&mut self) {
+        self.calibrator.withdraw();
+    }
+
+    /// Puts a neutral to use; false where it spans no plane: the one in use stays, and the search goes on.
+    fn try_neutral(&mut self, character: &Character, t: f64, found: Found) -> bool {
+        // What refines a neutral that was asked for is asked for by nobody.
+        let is_requested = found.is_awaited && found.calibration.requested;
+        let is_adopted = self.adopt(character, found.calibration).is_ok();
+        if is_adopted {
+            self.calibrator.accepted(is_requested);
+        } else {
+            self.calibrator.refused(t, is_requested);
+        }
+        is_adopted
     }
 
     fn poll(&mut self, t: f64) -> Option<Found> {
@@ -215,9 +240,11 @@ impl LandmarkSession {
         let fit = self.place(t)?;
         let (pose, refused_since) = self.judge(t, fit);
         let is_refused = refused_since.is_some_and(|since| t - since < LONGEST_REFUSAL);
-        self.lift(&pose);
-        let is_first = self.retarget.is_none();
-        if is_first {
+        if !is_refused {
+            // Rays that the pose does not belong to would scatter all over the face.
+            self.lift(&pose);
+        }
+        if self.retarget.is_none() {
             let provisional = calibration::provisional(t, &self.lifted, &self.model, &pose, self.pivot);
             self.adopt(character, provisional)?;
         }
@@ -227,14 +254,16 @@ impl LandmarkSession {
         if !is_refused {
             self.calibrator.observe(t, &self.observation.rays, &pose, &self.lifted, self.unit);
             if let Some(found) = self.poll(t) {
-                solved.is_new_neutral = self.adopt(character, found.calibration).is_ok();
-                solved.is_to_report = found.is_awaited && solved.is_new_neutral;
+                let is_awaited = found.is_awaited;
+                solved.is_new_neutral = self.try_neutral(character, t, found);
+                solved.is_to_report = is_awaited && solved.is_new_neutral;
                 // The performer's head has another shape now: look at the frame again.
                 if let Ok(fit) = self.place(t) {
                     self.pose = Some(fit.pose);
                     self.lift(&fit.pose);
                 }
             }
+            self.settle();
         }
         self.smooth(dt);
         if let Some(retarget) = &mut self.retarget {
@@ -257,9 +286,14 @@ impl LandmarkSession {
         let rays = &self.observation.rays;
         self.placing.clear();
         self.placing.extend(self.points.stable.iter().filter(|(i, _)| self.observation.is_sure[*i]));
-        if self.placing.len() < 4 {
+        // All of them do, or the layout would have no perspective.
+        if self.placing.len() < self.points.stable.len() && !head_pose::spans(&self.model, &self.placing, self.unit) {
             self.placing.clear();
             self.placing.extend_from_slice(&self.points.stable);
+        }
+        let spread = head_pose::spread(rays, &self.placing);
+        if spread.is_nan() || spread < self.camera.least_spread() {
+            return Err(head_pose::ONE_PLACE);
         }
         if !self.points.has_perspective {
             let pose = head_pose::frontal_pose(&self.model, rays, &self.placing)?;
@@ -289,15 +323,27 @@ impl LandmarkSession {
 
     fn lift(&mut self, pose: &Pose) {
         let matrix = pose.matrix();
-        let is_first = self.retarget.is_none();
         for (i, lifted) in self.lifted.iter_mut().enumerate() {
-            if self.observation.is_sure[i] || is_first {
+            if self.observation.is_sure[i] {
                 let point = head_pose::lift(&matrix, pose.translation, self.observation.rays[i], self.model[i].z);
                 *lifted = DVec2::new(point.x, point.y);
             } else {
                 // What is not believed shall not come back through a neutral either.
                 self.observation.rays[i] = head_pose::project(&matrix, pose.translation, lifted.extend(self.model[i].z));
             }
+        }
+    }
+
+    /// Lets mouth and chin lie at the depth that explains how they slid together; the rest of the face stays as lifted.
+    fn settle(&mut self) {
+        for (i, settled) in self.settled.iter_mut().enumerate() {
+            if self.observation.is_sure[i] {
+                *settled = self.lifted[i];
+            }
+        }
+        if let Some(pose) = &self.pose {
+            let Observation { rays, is_sure } = &self.observation;
+            self.lower_face.settle(pose, rays, is_sure, &mut self.settled);
         }
     }
 
@@ -311,6 +357,9 @@ impl LandmarkSession {
         for (model, neutral) in self.model.iter_mut().zip(&calibration.points) {
             *model = DVec3::from(*neutral);
         }
+        let rotation = DQuat::from_array(calibration.head_rotation);
+        let translation = DVec3::from(calibration.head_position) - rotation::rotate(rotation, self.pivot);
+        self.lower_face.adopt(&self.model, &Pose { rotation, translation });
         self.calibration = Some(calibration);
         for filter in [&mut self.brows, &mut self.eyelids, &mut self.mouth] {
             filter.bank.reset();
@@ -322,8 +371,8 @@ impl LandmarkSession {
     fn smooth(&mut self, dt: f64) {
         for filter in [&mut self.brows, &mut self.eyelids, &mut self.mouth] {
             for (pair, &i) in filter.samples.chunks_exact_mut(2).zip(&filter.points) {
-                pair[0] = self.lifted[i].x;
-                pair[1] = self.lifted[i].y;
+                pair[0] = self.settled[i].x;
+                pair[1] = self.settled[i].y;
             }
             let smoothed = filter.bank.update(&filter.samples, dt);
             for (pair, &i) in smoothed.chunks_exact(2).zip(&filter.points) {

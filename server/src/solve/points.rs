@@ -1,6 +1,7 @@
 //! The points a session's landmarks become: which of the layout's they are, where the character has them, what they serve.
 
 use super::error::SolveError;
+use super::head_pose;
 use glam::DVec3;
 use rhytid_shared::Character;
 use rhytid_shared::character::{Drive, LandmarkWeight, Side};
@@ -50,6 +51,8 @@ pub(super) struct PointSet {
     pub(super) groups: Vec<Group>,
     /// Points that expressions move little, with their weights in the head pose.
     pub(super) stable: Vec<(usize, f64)>,
+    /// Points of mouth and chin; none where there is no pose in perspective.
+    pub(super) lower: Vec<usize>,
     /// True where they are enough for a pose in perspective; else size, roll and place are all that is taken.
     pub(super) has_perspective: bool,
     /// The point on the other side of the face (irises after the points, where the layout has them); itself where unknown.
@@ -104,6 +107,7 @@ impl PointSet {
             groups: (0..NUM_IBUG).map(group_of).collect(),
             mirror: IBUG_MIRROR.into_iter().chain(irises.iter().flat_map(|_| [NUM_IBUG + 1, NUM_IBUG])).collect(),
             stable: IBUG_STABLE.iter().map(|&i| (i, weight_of(i))).collect(),
+            lower: (0..NUM_IBUG).filter(|&i| is_lower(i)).collect(),
             has_perspective: true,
             centres: (0..NUM_IBUG).filter(|&i| is_centre(i)).collect(),
             is_ibug: true,
@@ -132,14 +136,14 @@ impl PointSet {
             source_of.push(if mirror { partner } else { index });
             opposite.push(partner);
         }
-        let nearest_ibug = |p: DVec3| -> (usize, f64) {
-            (0..NUM_IBUG)
-                .map(|i| (i, character.ibug68[i].as_dvec3().distance(p)))
-                .fold((0, f64::INFINITY), |best, one| if one.1 < best.1 { one } else { best })
+        let nearest_ibug = |p: &DVec3| -> usize {
+            let distances = (0..NUM_IBUG).map(|i| (i, character.ibug68[i].as_dvec3().distance(*p)));
+            distances.fold((0, f64::INFINITY), |best, one| if one.1 < best.1 { one } else { best }).0
         };
-        let groups = model
+        let nearest: Vec<usize> = model.iter().map(nearest_ibug).collect();
+        let groups = nearest
             .iter()
-            .map(|&p| match nearest_ibug(p).0 {
+            .map(|&i| match i {
                 17..=26 => Group::Brows,
                 36..=47 => Group::Eyelids,
                 _ => Group::Mouth,
@@ -151,7 +155,7 @@ impl PointSet {
             .map(|p| IBUG_STABLE.iter().map(|&i| character.ibug68[i].as_dvec3().distance(*p) / unit).fold(f64::INFINITY, f64::min))
             .collect();
         let mut stable: Vec<(usize, f64)> = (0..off.len()).filter(|&i| off[i] < STABLE_REACH).map(|i| (i, 1.0)).collect();
-        let has_perspective = stable.len() >= FEWEST_STABLE;
+        let has_perspective = stable.len() >= FEWEST_STABLE && head_pose::spans(&model, &stable, unit);
         if !has_perspective {
             // All of them, or the brows of a layout of brows and lips would be believed to be still.
             let weight = |off: f64| {
@@ -181,6 +185,7 @@ impl PointSet {
             model,
             groups,
             stable,
+            lower: if has_perspective { (0..names.len()).filter(|&i| is_lower(nearest[i])).collect() } else { Vec::new() },
             has_perspective,
             is_ibug: false,
             shares,
@@ -199,6 +204,11 @@ impl PointSet {
             Side::Left => LEFT_EYE,
         })
     }
+}
+
+/// iBUG's landmarks of mouth and chin.
+fn is_lower(ibug: usize) -> bool {
+    matches!(ibug, 6..=10 | 48..=67)
 }
 
 /// The landmarks that move a bone; none for lids and eyes, which have measures of their own.

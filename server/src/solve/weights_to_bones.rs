@@ -260,7 +260,6 @@ impl Correctives {
 /// The Gaussian is positive definite, so its ridge is added.
 fn solve_gaussians(centres: &[Vec<f32>]) -> Option<(f64, Lu)> {
     let num = centres.len();
-    let square = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(a - b) * f64::from(a - b)).sum::<f64>();
     let nearest = |m: usize| (0..num).filter(|&e| e != m).map(|e| square(&centres[m], &centres[e]).sqrt()).fold(f64::INFINITY, f64::min);
     let sigma = (0..num).map(nearest).sum::<f64>() / num as f64;
     if !(sigma > 0.0 && sigma.is_finite()) {
@@ -269,20 +268,33 @@ fn solve_gaussians(centres: &[Vec<f32>]) -> Option<(f64, Lu)> {
     let falloff = -0.5 / (sigma * sigma);
     let mut ridge = 0.0;
     loop {
-        let mut matrix = vec![0.0; num * num];
-        for e in 0..num {
-            for m in 0..num {
-                matrix[e * num + m] = libm::exp(square(&centres[e], &centres[m]) * falloff);
-            }
-            matrix[e * num + e] += ridge;
-        }
-        let norm = (0..num).map(|m| (0..num).map(|e| matrix[e * num + m]).sum::<f64>()).fold(0.0, f64::max);
-        match Lu::factor(matrix, num) {
-            Some(lu) if norm * lu.inverse_norm() < WORST_CONDITION => return Some((falloff, lu)),
+        match factor_gaussians(centres, falloff, ridge) {
+            Some((lu, condition)) if condition < WORST_CONDITION => return Some((falloff, lu)),
             _ if ridge > 1.0 => return None,
             _ => ridge = if ridge == 0.0 { 1e-6 } else { ridge * 10.0 },
         }
     }
+}
+
+/// The Gaussians at `centres` with `ridge` on the diagonal, factored, and the condition number of that (by 1-norms).
+fn factor_gaussians(centres: &[Vec<f32>], falloff: f64, ridge: f64) -> Option<(Lu, f64)> {
+    let num = centres.len();
+    let mut matrix = vec![0.0; num * num];
+    for e in 0..num {
+        for m in 0..num {
+            matrix[e * num + m] = libm::exp(square(&centres[e], &centres[m]) * falloff);
+        }
+        matrix[e * num + e] += ridge;
+    }
+    let norm = (0..num).map(|m| (0..num).map(|e| matrix[e * num + m]).sum::<f64>()).fold(0.0, f64::max);
+    let lu = Lu::factor(matrix, num)?;
+    let condition = norm * lu.inverse_norm();
+    Some((lu, condition))
+}
+
+/// Squared distance.
+fn square(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| f64::from(a - b) * f64::from(a - b)).sum()
 }
 
 #[cfg(test)]
@@ -293,7 +305,10 @@ mod tests {
     fn gaussian_weights_interpolate_and_decay_to_the_linear_rig() {
         // Two channels of linear deltas (6, -4) on one bone; the example at (1, 1) wants 0.5 and everything else is linear.
         let centres: Vec<Vec<f32>> = vec![vec![0.0, 0.0], vec![1.0, 0.0], vec![0.0, 1.0], vec![1.0, 1.0]];
-        let square = |a: &[f32], b: [f64; 2]| (f64::from(a[0]) - b[0]).powi(2) + (f64::from(a[1]) - b[1]).powi(2);
+        let square = |a: &[f32], b: [f64; 2]| {
+            let (x, y) = (f64::from(a[0]) - b[0], f64::from(a[1]) - b[1]);
+            x * x + y * y
+        };
         // With sigma = 0.6 in place of the mean distance of 1: distances scaled by 1 / 0.6.
         let scaled: Vec<Vec<f32>> = centres.clone();
         let (falloff, lu) = solve_gaussians(&scaled).expect("well-conditioned");
@@ -307,6 +322,28 @@ mod tests {
             assert!((corrected(w) - want).abs() < 1e-9, "{w:?}: {}", corrected(w));
         }
         assert!((corrected([6.0, 6.0]) - 12.0).abs() < 1e-3, "far away the linear rig is left");
+    }
+
+    #[test]
+    fn gaussians_of_a_given_width_agree_with_the_worked_example() {
+        let centres: Vec<Vec<f32>> = vec![vec![0.0, 0.0], vec![1.0, 0.0], vec![0.0, 1.0], vec![1.0, 1.0]];
+        let falloff = -0.5 / (0.6 * 0.6);
+        let (lu, condition) = factor_gaussians(&centres, falloff, 0.0).expect("regular");
+        assert!((condition - 2.7701).abs() < 1e-4, "{condition}");
+        let weights = lu.solve(&[0.0, 6.0, -4.0, 0.5]);
+        for (got, want) in weights.iter().zip([-0.53167631, 6.39742519, -4.26556231, 0.00147307]) {
+            assert!((got - want).abs() < 1e-8, "{weights:?}");
+        }
+        let bells = |weights: &[f64], at: [f32; 2]| -> f64 {
+            centres.iter().zip(weights).map(|(centre, weight)| weight * libm::exp(falloff * square(centre, &at))).sum()
+        };
+        assert!((bells(&weights, [0.5, 0.0]) - 3.39367045).abs() < 1e-8);
+        // On what the linear layer (6, -4) lacks.
+        let residual = lu.solve(&[0.0, 0.0, 0.0, 0.5 - 2.0]);
+        for (at, want) in [([0.5, 0.0], 3.0), ([0.5, 0.5], 0.52012504)] {
+            let got = 6.0 * f64::from(at[0]) - 4.0 * f64::from(at[1]) + bells(&residual, at);
+            assert!((got - want).abs() < 1e-8, "{at:?}: {got}");
+        }
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! Values to integer codes and back. Zero, one and identity are exact.
 
+#![deny(clippy::disallowed_methods)]
+
 use crate::limits::MAX_HEAD_TRAVEL;
 use glam::Quat;
 
@@ -51,7 +53,7 @@ impl<const BITS: u32> SmallestThree<BITS> {
 
     /// Quantises `rotation`, which is normalised first; what cannot be normalised counts as identity.
     pub fn new(rotation: Quat) -> Self {
-        let length = rotation.length();
+        let length = length_of(rotation.to_array());
         if !(length > 1e-3 && length.is_finite()) {
             return Self::IDENTITY;
         }
@@ -82,12 +84,21 @@ impl<const BITS: u32> SmallestThree<BITS> {
         }
         q[usize::from(self.dropped)] = rest.max(0.0).sqrt();
         // Three codes at the end of their range make more than unit length; the codes of a real rotation do not.
-        let q = Quat::from_array(q);
-        if rest < 0.0 { q.normalize() } else { q }
+        if rest < 0.0 {
+            let length = length_of(q);
+            q = q.map(|component| component / length);
+        }
+        Quat::from_array(q)
     }
 }
 
+/// Written out: a vector unit would add in an order of its own, and packets have the same bits on every machine.
+fn length_of([x, y, z, w]: [f32; 4]) -> f32 {
+    (x * x + y * y + z * z + w * w).sqrt()
+}
+
 #[cfg(test)]
+#[allow(clippy::disallowed_methods, reason = "a test compares with a tolerance")]
 mod tests {
     use super::*;
     use glam::Vec3;

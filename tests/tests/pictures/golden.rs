@@ -1,19 +1,21 @@
-//! Golden pictures. Each comes with a wrong picture that must not pass for it.
+//! Golden pictures. Each comes with wrong pictures that must not pass for it: another blend, weaker wrinkles, another
+//! solve. How near a picture must come is a share of how far the wrong ones are, so the rules hold for any character.
 
 use crate::{Add, Stage};
 use anyhow::{Context, ensure};
+use glam::Vec3;
 use image::{Rgb, RgbImage, RgbaImage};
 use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
 use rhytid_client::{BlendMode, Camera, DrawSettings, RenderFrame, ViewMode};
 use rhytid_server::feed::{Feed, FeedItem};
 use rhytid_server::pipeline::Pipeline;
-use rhytid_server::solve::SolveConfig;
+use rhytid_server::solve::{OneEuroConfig, SolveConfig};
 use rhytid_shared::{Character, FaceFrame, TrackingData, TrackingFrame};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Side of a golden, pixels: small enough to commit, large enough for furrows.
-const SIDE: u32 = 256;
+pub const SIDE: u32 = 256;
 /// A channel that is off by more than this many codes counts as different: another version of the software adapter
 /// rounds and places samples a little differently.
 const CODES: u8 = 10;
@@ -21,13 +23,22 @@ const CODES: u8 = 10;
 const MOST_DIFFERENT: usize = (SIDE * SIDE / 400) as usize;
 /// Mean difference over all channels, codes.
 const MOST_MEAN: f64 = 0.5;
+/// A wrong picture shows where it is off by at least this many codes in a channel …
+const SHOWS: u8 = 4;
+/// … and must show in this many pixels, or the golden would say nothing about it.
+const LEAST_SHOWN: usize = (SIDE * SIDE / 200) as usize;
+/// There, the right picture must be nearer to the golden than this share of the wrong one's distance.
+const MOST_SHARE: f64 = 0.25;
 
 /// What one golden shows.
 #[derive(Clone)]
 pub struct Shot {
     pub face: Face,
+    /// Multiplies all influences.
+    pub strength: f32,
     pub view: &'static str,
     pub blend: BlendMode,
+    pub lens: Lens,
 }
 
 /// The face one golden shows.
@@ -36,74 +47,156 @@ pub enum Face {
     Rest,
     Pose(&'static str, f32, StillSide),
     /// The frame of the built-in session with this index, solved with all that came before it.
-    Session(usize),
+    Session(usize, Solve),
 }
 
-const REST: Shot = Shot { face: Face::Rest, view: "beauty", blend: BlendMode::PartialDerivatives };
+/// How a session is solved.
+#[derive(Clone, Copy)]
+pub enum Solve {
+    Default,
+    /// Landmarks smoothed twice as much.
+    Smoother,
+}
 
-const fn posed(pose: &'static str) -> Shot {
+/// Frames of the built-in session in which much moves, so that what the solve does to motion shows.
+const BROWS_RISE: usize = 64;
+const SMILE_BEGINS: usize = 176;
+const JAW_DROPS: usize = 282;
+const LIPS_PUCKER: usize = 492;
+
+/// Where the picture is taken from; always the front.
+#[derive(Clone, Copy)]
+pub enum Lens {
+    /// Closer than the default, so that the face fills the picture.
+    Face,
+    /// Brows and forehead.
+    Forehead,
+    /// Half as wide, above the brows.
+    Furrows,
+}
+
+pub const REST: Shot = Shot { face: Face::Rest, strength: 1.0, view: "beauty", blend: BlendMode::PartialDerivatives, lens: Lens::Face };
+
+pub const fn posed(pose: &'static str) -> Shot {
     Shot { face: Face::Pose(pose, 1.0, StillSide::Both), ..REST }
 }
 
 const fn in_session(frame: usize) -> Shot {
-    Shot { face: Face::Session(frame), ..REST }
+    Shot { face: Face::Session(frame, Solve::Default), ..REST }
 }
 
-/// Name, golden, and the wrong picture.
-fn shots() -> Vec<(&'static str, Shot, Shot)> {
-    let stretch = || posed("stretch");
-    let viewed = |view: &'static str| Shot { view, ..stretch() };
-    let blended = |blend: BlendMode| Shot { blend, ..stretch() };
+fn weaker(shot: &Shot) -> Shot {
+    Shot { strength: 0.8 * shot.strength, ..shot.clone() }
+}
+
+/// Name, golden, and the wrong pictures.
+fn shots() -> Vec<(&'static str, Shot, Vec<Shot>)> {
+    let viewed = |view: &'static str| Shot { view, ..posed("stretch") };
     let raised = |amount: f32, side: StillSide| Shot { face: Face::Pose("stretch", amount, side), ..REST };
-    vec![
-        ("neutral", REST, stretch()),
-        ("stretch", stretch(), viewed("bare")),
-        ("compress", posed("compress"), REST),
-        ("smile", posed("smile"), REST),
-        ("pucker", posed("pucker"), REST),
-        ("stretch_half", raised(0.5, StillSide::Both), stretch()),
-        ("stretch_right_only", raised(1.0, StillSide::Right), raised(1.0, StillSide::Left)),
-        ("stretch_blend_simple", blended(BlendMode::Simple), viewed("bare")),
-        ("stretch_blend_printed", blended(BlendMode::Printed), viewed("bare")),
-        ("stretch_view_bare", viewed("bare"), stretch()),
-        ("stretch_view_split", viewed("split"), stretch()),
-        ("stretch_view_influence", viewed("influence"), viewed("influence:stretch")),
-        ("stretch_view_influence_stretch", viewed("influence:stretch"), viewed("influence:compress")),
-        ("stretch_view_normals", viewed("normals"), Shot { view: "normals", ..REST }),
-        ("session_brows", in_session(110), in_session(30)),
-        ("session_smile", in_session(200), in_session(110)),
-        ("session_jaw", in_session(350), in_session(200)),
-        ("stretch_view_wireframe", viewed("wireframe"), Shot { view: "wireframe", ..REST }),
-    ]
+    let forehead = |shot: Shot| Shot { lens: Lens::Forehead, view: "normals", ..shot };
+    let mut shots = vec![
+        ("neutral", REST, vec![posed("stretch")]),
+        ("compress", posed("compress"), vec![REST]),
+        ("smile", posed("smile"), vec![REST]),
+        ("pucker", posed("pucker"), vec![REST]),
+        ("stretch", posed("stretch"), vec![viewed("bare")]),
+        ("stretch_half", raised(0.5, StillSide::Both), vec![posed("stretch")]),
+        ("stretch_right_only", raised(1.0, StillSide::Right), vec![raised(1.0, StillSide::Left)]),
+        ("stretch_view_bare", viewed("bare"), vec![posed("stretch")]),
+        ("stretch_view_split", viewed("split"), vec![posed("stretch"), viewed("bare")]),
+        ("stretch_view_influence", viewed("influence"), vec![viewed("influence:stretch"), weaker(&viewed("influence"))]),
+        ("stretch_view_influence_stretch", viewed("influence:stretch"), vec![viewed("influence:compress")]),
+        ("stretch_view_normals", viewed("normals"), vec![Shot { view: "normals", ..REST }]),
+        ("stretch_view_wireframe", viewed("wireframe"), vec![Shot { view: "wireframe", ..REST }]),
+    ];
+    for (name, pose) in [("stretch_forehead", "stretch"), ("compress_forehead", "compress")] {
+        let shot = forehead(posed(pose));
+        shots.push((name, shot.clone(), vec![weaker(&shot)]));
+    }
+    for (name, frame) in [("session_brows", BROWS_RISE), ("session_smile", SMILE_BEGINS), ("session_jaw", JAW_DROPS)] {
+        let smoother = Shot { face: Face::Session(frame, Solve::Smoother), ..REST };
+        shots.push((name, in_session(frame), vec![REST, smoother]));
+    }
+    for (name, frame) in
+        [("session_brows_influence", BROWS_RISE), ("session_smile_influence", SMILE_BEGINS), ("session_pucker_influence", LIPS_PUCKER)]
+    {
+        let shown = |solve| Shot { face: Face::Session(frame, solve), view: "influence", ..REST };
+        shots.push((name, shown(Solve::Default), vec![shown(Solve::Smoother), weaker(&shown(Solve::Default))]));
+    }
+    shots
 }
 
 pub fn add(add: &mut Add<'_>) {
     for (name, shot, wrong) in shots() {
         add(format!("golden::{name}"), Box::new(move |stage| check(stage, name, &shot, &wrong)));
     }
+    for (number, blend) in BlendMode::ALL.into_iter().enumerate() {
+        let name = ["blend_pd", "blend_simple", "blend_printed"][number];
+        let check = move |stage: &Stage| {
+            let others = BlendMode::ALL.into_iter().filter(|other| *other != blend).map(|other| blended(other, 1.0));
+            check(&rough(stage)?, name, &blended(blend, 1.0), &others.chain([blended(blend, 0.8)]).collect::<Vec<_>>())
+        };
+        add(format!("golden::{name}"), Box::new(check));
+    }
 }
 
-/// Draws a shot from the front, closer than the default so that the face fills the picture.
+/// Close to the furrows of a raised brow, as normals.
+fn blended(blend: BlendMode, strength: f32) -> Shot {
+    Shot { lens: Lens::Furrows, view: "normals", blend, strength, ..posed("stretch") }
+}
+
+/// The character with four times as steep pores: blends differ by what they make of a slope under a furrow, and the
+/// character's own pores are too shallow to show it.
+fn rough(stage: &Stage) -> anyhow::Result<Stage> {
+    stage.variant(|asset| asset.primitives.iter_mut().for_each(|primitive| primitive.material.normal_scale *= 4.0))
+}
+
+/// Draws a shot from the front.
 pub fn draw(stage: &Stage, shot: &Shot, side: u32) -> anyhow::Result<RgbaImage> {
     let character = &stage.asset.character;
     let posed = |points| -> anyhow::Result<FaceFrame> { Ok(solve_one(character, TrackingData::Bones { points, head: None })?) };
-    let frame = RenderFrame::from(&match shot.face {
+    let mut frame = RenderFrame::from(&match shot.face {
         Face::Rest => posed(Vec::new())?,
         Face::Pose(pose, amount, side) => posed(posed_points(character, pose, amount, side)?)?,
-        Face::Session(index) => session_frame(character, index)?,
+        Face::Session(index, solve) => session_frame(character, solve, index)?,
     });
-    let mut camera = Camera::front(character);
-    camera.zoom(0.62);
+    frame.influences.iter_mut().for_each(|influence| *influence *= shot.strength);
+    let camera = camera(character, shot.lens);
     let settings = DrawSettings { view: ViewMode::parse(shot.view, character)?, blend: shot.blend, ..DrawSettings::new(camera) };
-    let mut headless = stage.headless.lock().map_err(|_| anyhow::anyhow!("another test broke the renderer"))?;
+    let mut headless = stage.headless()?;
     Ok(headless.render([side, side], &settings, &frame)?)
 }
 
+pub fn camera(character: &Character, lens: Lens) -> Camera {
+    let mut camera = Camera::front(character);
+    let marks = &character.ibug68;
+    let (brows, width) = ((marks[19] + marks[24]) * 0.5, marks[17].distance(marks[26]));
+    // Widths of the picture and heights of its middle above the brows, in units of the brows' whole width.
+    let (seen, above) = match lens {
+        Lens::Face => {
+            camera.zoom(0.62);
+            return camera;
+        }
+        Lens::Forehead => (1.0, 0.18),
+        Lens::Furrows => (0.5, 0.28),
+    };
+    camera.target = brows + Vec3::Y * above * width;
+    camera.distance = 0.5 * seen * width / (0.5 * camera.fovy).tan();
+    camera
+}
+
 /// Replays the built-in session up to one of its frames.
-fn session_frame(character: &Arc<Character>, index: usize) -> anyhow::Result<FaceFrame> {
+fn session_frame(character: &Arc<Character>, solve: Solve, index: usize) -> anyhow::Result<FaceFrame> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/assets/demo.ibug68.jsonl");
     let mut feed = Feed::open(&path, character)?;
-    let mut pipeline = Pipeline::new(Arc::clone(character), &SolveConfig::default(), &feed.hello, 1)?;
+    let mut config = SolveConfig::default();
+    if matches!(solve, Solve::Smoother) {
+        for OneEuroConfig { min_cutoff, beta, .. } in [&mut config.filter.brows, &mut config.filter.mouth] {
+            *min_cutoff *= 0.5;
+            *beta *= 0.5;
+        }
+    }
+    let mut pipeline = Pipeline::new(Arc::clone(character), &config, &feed.hello, 1)?;
     let mut frame = TrackingFrame { t: 0.0, data: TrackingData::NoFace };
     let (mut packet, mut num_frames) = (Vec::new(), 0);
     while let Some(item) = feed.next_frame(&mut frame)? {
@@ -117,7 +210,7 @@ fn session_frame(character: &Arc<Character>, index: usize) -> anyhow::Result<Fac
     anyhow::bail!("the built-in session has {num_frames} frames, none with index {index}")
 }
 
-fn check(stage: &Stage, name: &str, shot: &Shot, wrong: &Shot) -> anyhow::Result<()> {
+fn check(stage: &Stage, name: &str, shot: &Shot, wrong: &[Shot]) -> anyhow::Result<()> {
     let golden_path = Path::new(env!("CARGO_MANIFEST_DIR")).join("goldens").join(format!("{name}.png"));
     let actual = draw(stage, shot, SIDE)?;
     if std::env::var_os("RHYTID_UPDATE_GOLDENS").is_some_and(|value| value == "1") {
@@ -127,13 +220,52 @@ fn check(stage: &Stage, name: &str, shot: &Shot, wrong: &Shot) -> anyhow::Result
     let golden = image::open(&golden_path)
         .with_context(|| format!("{} (make it with RHYTID_UPDATE_GOLDENS=1, then look at it)", golden_path.display()))?
         .into_rgba8();
-    if let Err(problem) = compare(&actual, &golden) {
-        let (actual_path, difference_path) = write_out(name, &actual, &golden)?;
-        anyhow::bail!("{problem}; see {} and {}", actual_path.display(), difference_path.display());
+    let written_out = |problem: String| match write_out(name, &actual, &golden) {
+        Ok((actual, difference)) => anyhow::anyhow!("{problem}; see {} and {}", actual.display(), difference.display()),
+        Err(error) => error.context(problem),
+    };
+    compare(&actual, &golden).map_err(written_out)?;
+    for (number, wrong) in wrong.iter().enumerate() {
+        let wrong = draw(stage, wrong, SIDE)?;
+        let apart = Apart::new(&actual, &wrong, &golden);
+        ensure!(
+            apart.num_shown >= LEAST_SHOWN,
+            "wrong picture {number} of {name} shows in {} pixels only, of at least {LEAST_SHOWN}: this golden says nothing about it",
+            apart.num_shown
+        );
+        if apart.share > MOST_SHARE {
+            return Err(written_out(format!(
+                "{:.2} as far from the golden as wrong picture {number} is, at most {MOST_SHARE} is near enough",
+                apart.share
+            )));
+        }
     }
-    let wrong = draw(stage, wrong, SIDE)?;
-    ensure!(compare(&wrong, &golden).is_err(), "the wrong picture passes for {name}: this golden shows nothing");
     Ok(())
+}
+
+/// How a picture and a wrong one lie to the golden.
+struct Apart {
+    /// Pixels where the wrong one shows.
+    num_shown: usize,
+    /// Distance of the picture from the golden over those, in units of the wrong one's.
+    share: f64,
+}
+
+impl Apart {
+    fn new(actual: &RgbaImage, wrong: &RgbaImage, golden: &RgbaImage) -> Self {
+        let channels = |a: &image::Rgba<u8>, b: &image::Rgba<u8>| [0, 1, 2].map(|channel: usize| a[channel].abs_diff(b[channel]));
+        let sum = |apart: [u8; 3]| apart.map(u64::from).iter().sum::<u64>();
+        let (mut num_shown, mut of_actual, mut of_wrong) = (0, 0, 0);
+        for ((actual, wrong), golden) in actual.pixels().zip(wrong.pixels()).zip(golden.pixels()) {
+            let apart = channels(wrong, golden);
+            if apart.iter().any(|codes| *codes >= SHOWS) {
+                num_shown += 1;
+                of_wrong += sum(apart);
+                of_actual += sum(channels(actual, golden));
+            }
+        }
+        Self { num_shown, share: of_actual as f64 / (of_wrong as f64).max(1.0) }
+    }
 }
 
 /// Says how two pictures differ by more than the tolerance.

@@ -12,24 +12,43 @@ mod twins;
 
 use libtest_mimic::{Arguments, Trial};
 use rhytid_client::renderer::AdapterChoice;
-use rhytid_client::{CharacterAsset, Headless};
+use rhytid_client::{CharacterAsset, Headless, RenderError};
 use rhytid_shared::DEFAULT_CHARACTER_GLB;
 use std::process::ExitCode;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// The built-in character on a software adapter; tests take turns.
 pub struct Stage {
     /// The character.
     pub asset: CharacterAsset,
     /// What draws it.
-    pub headless: Mutex<Headless>,
+    headless: Mutex<Headless>,
+}
+
+impl Stage {
+    fn new(asset: CharacterAsset) -> Result<Self, RenderError> {
+        let headless = Mutex::new(Headless::on(&asset, AdapterChoice::Software)?);
+        Ok(Self { asset, headless })
+    }
+
+    /// The same character with a change, on a device of its own.
+    pub fn variant(&self, change: impl FnOnce(&mut CharacterAsset)) -> anyhow::Result<Self> {
+        let mut asset = CharacterAsset::from_glb(DEFAULT_CHARACTER_GLB)?;
+        change(&mut asset);
+        Ok(Self::new(asset)?)
+    }
+
+    /// The renderer, when its turn comes.
+    pub fn headless(&self) -> anyhow::Result<MutexGuard<'_, Headless>> {
+        self.headless.lock().map_err(|_| anyhow::anyhow!("another test broke the renderer"))
+    }
 }
 
 fn main() -> ExitCode {
     let arguments = Arguments::from_args();
     let asset = CharacterAsset::from_glb(DEFAULT_CHARACTER_GLB).expect("the built-in character is whole");
-    let stage = match Headless::on(&asset, AdapterChoice::Software) {
-        Ok(headless) => Some(Arc::new(Stage { asset, headless: Mutex::new(headless) })),
+    let stage = match Stage::new(asset) {
+        Ok(stage) => Some(Arc::new(stage)),
         Err(error) => {
             eprintln!("ignored: {error}");
             None

@@ -1,14 +1,13 @@
 //! Expression shapes: the device against its twin, and that a face is deformed by shapes or by bones, never by both.
 
-use crate::twins::{Sequence, all_vertices, headless, moving_frame, probe_skinning};
+use crate::twins::{Sequence, all_vertices, moving_frame, probe_skinning};
 use crate::{Add, Stage};
 use anyhow::{Context, ensure};
 use glam::{Quat, Vec3, Vec4};
 use image::RgbaImage;
 use rhytid_client::asset::{Morphs, Vertex};
-use rhytid_client::renderer::AdapterChoice;
 use rhytid_client::{Camera, CharacterAsset, Deformation, DrawSettings, Headless, RenderFrame, ViewMode, twin};
-use rhytid_shared::{ARKIT_NAMES, ArkitShape, Character, DEFAULT_CHARACTER_GLB, NUM_ARKIT_SHAPES};
+use rhytid_shared::{ARKIT_NAMES, ArkitShape, Character, NUM_ARKIT_SHAPES};
 
 const SIDE: u32 = 256;
 
@@ -131,7 +130,7 @@ fn in_place_of_bones(stage: &Stage) -> anyhow::Result<()> {
     both.head = rest.head;
     // What wrinkles is the influences, whatever deforms.
     both.influences.fill(0.0);
-    let mut headless = headless(stage)?;
+    let mut headless = stage.headless()?;
     // Normals tell the shape; the light in mouth and eyes follows the frame's lips and gaze.
     let mut normals = |deform, frame: &RenderFrame| draw_view(&mut headless, character, (deform, ViewMode::Normals), frame);
     let (of_shapes, none) = (normals(Deformation::Shapes, &smile)?, normals(Deformation::Bones, &smile)?);
@@ -155,14 +154,15 @@ fn fallback(stage: &Stage) -> anyhow::Result<()> {
     let character = &stage.asset.character;
     let frame = RenderFrame { shapes: None, ..moving_frame(stage)? };
     {
-        let mut headless = headless(stage)?;
+        let mut headless = stage.headless()?;
         let asked = draw(&mut headless, character, Deformation::Shapes, &frame)?;
         ensure!(asked == draw(&mut headless, character, Deformation::Bones, &frame)?, "a frame without weights is another face");
     }
-    let mut asset = CharacterAsset::from_glb(DEFAULT_CHARACTER_GLB)?;
-    asset.morphs = Morphs::default();
-    asset.primitives.iter_mut().flat_map(|primitive| &mut primitive.vertices).for_each(|vertex| vertex.morphs = [0; 2]);
-    let mut plain = Headless::on(&asset, AdapterChoice::Software)?;
+    let plain = stage.variant(|asset| {
+        asset.morphs = Morphs::default();
+        asset.primitives.iter_mut().flat_map(|primitive| &mut primitive.vertices).for_each(|vertex| vertex.morphs = [0; 2]);
+    })?;
+    let mut plain = plain.headless()?;
     let frame = RenderFrame { shapes: Some([1.0; NUM_ARKIT_SHAPES]), ..frame };
     let asked = draw(&mut plain, character, Deformation::Shapes, &frame)?;
     ensure!(asked == draw(&mut plain, character, Deformation::Bones, &frame)?, "a character without shapes is another face");
@@ -180,7 +180,7 @@ fn head_turns(stage: &Stage) -> anyhow::Result<()> {
     let moved = turned.iter().map(|matrix| matrix.transform_point3(nose)).filter(|at| at.distance(nose) > 0.01).count();
     ensure!(moved >= character.num_bones() / 2, "{moved} joints carry the nose along");
     ensure!(turned.iter().any(|matrix| matrix.transform_point3(Vec3::ZERO) == Vec3::ZERO), "the bust stays");
-    let mut headless = headless(stage)?;
+    let mut headless = stage.headless()?;
     let a = draw(&mut headless, character, Deformation::Shapes, &frame)?;
     frame.head.rotation = Quat::IDENTITY;
     let count = num_different(&a, &draw(&mut headless, character, Deformation::Shapes, &frame)?);

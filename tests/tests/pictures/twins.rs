@@ -8,11 +8,11 @@ use rhytid_client::asset::{Morphs, Vertex};
 use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
 use rhytid_client::renderer::{VERTEX_LAYOUT, bone_major, pose_table, uniforms};
 use rhytid_client::twin::{self, WrinkleSample};
-use rhytid_client::{BlendMode, CharacterAsset, Headless, RenderFrame};
+use rhytid_client::{BlendMode, CharacterAsset, RenderFrame};
 use rhytid_shared::character::Pose;
 use rhytid_shared::limits::MAX_POSES;
 use rhytid_shared::{Character, TrackingData};
-use std::sync::{Arc, MutexGuard};
+use std::sync::Arc;
 
 /// Puts `value` of vertex `index` into pixel `index`; WHICH chooses the value.
 const SKINNING_PROBE: &str = "
@@ -96,10 +96,6 @@ impl Sequence {
     }
 }
 
-pub fn headless(stage: &Stage) -> anyhow::Result<MutexGuard<'_, Headless>> {
-    stage.headless.lock().map_err(|_| anyhow::anyhow!("another test broke the renderer"))
-}
-
 /// A frame in which everything moves: brows, jaw, head.
 pub fn moving_frame(stage: &Stage) -> anyhow::Result<RenderFrame> {
     let character = &stage.asset.character;
@@ -136,7 +132,7 @@ pub fn probe_skinning(
     coefficients[..size_of_val(vectors.as_slice())].copy_from_slice(bytemuck::cast_slice(&vectors));
     let table = pose_table(asset);
     let weights = uniforms::MorphWeights::new(frame.shapes.as_ref());
-    let headless = headless(stage)?;
+    let headless = stage.headless()?;
     let size = asset.morphs.texture_size();
     let mut texels: Vec<u8> = bytemuck::cast_slice(&asset.morphs.texels).to_vec();
     texels.resize((size[0] * size[1]) as usize * 8, 0);
@@ -264,7 +260,7 @@ fn blend(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
         groups: &[],
         what: What::Points { layout, bytes: bytemuck::cast_slice(&cases), count: cases.len() },
     };
-    let read = run(&*headless(stage)?, &probe)?;
+    let read = run(&*stage.headless()?, &probe)?;
     let other = BlendMode::ALL[(number + 1) % BlendMode::ALL.len()];
     let mut num_apart = 0;
     for (case, read) in cases.iter().zip(read) {
@@ -329,7 +325,7 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
         step_mode: wgpu::VertexStepMode::Vertex,
         attributes: &wgpu::vertex_attr_array![0 => Float32x2, 1 => Float32x3, 2 => Float32x4, 3 => Float32x4, 4 => Float32x4],
     };
-    let headless = headless(stage)?;
+    let headless = stage.headless()?;
     let view = |layers: &[Vec<u8>], dimension| {
         let side = MAP_SIDE as u32;
         texture(&headless, wgpu::TextureFormat::Rg8Unorm, [side, side], layers)

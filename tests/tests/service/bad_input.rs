@@ -245,7 +245,7 @@ fn a_publisher_that_reads_no_answers_loses_its_room() {
         while publisher.socket.send(Message::text("{}")).is_ok() {}
     });
     server.wait_for_room("demo", |room| room.is_some_and(|room| room["publisher"].is_null()));
-    assert_eq!(server.metric("rhytid_sessions_ended_total{reason=\"idle\"}"), 1.0);
+    server.wait_for_metric("rhytid_sessions_ended_total{reason=\"idle\"}", |count| count == 1.0);
     flood.join().unwrap();
 }
 

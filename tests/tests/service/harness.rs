@@ -145,6 +145,17 @@ impl Server {
         let text = String::from_utf8(body).unwrap();
         text.lines().find(|line| line.starts_with(start)).and_then(|line| line.rsplit(' ').next()?.parse().ok()).unwrap_or(0.0)
     }
+
+    /// Waits until a metric is as `is_so` wants it: the server counts after it has acted.
+    pub fn wait_for_metric(&self, start: &str, is_so: impl Fn(f64) -> bool) {
+        for _ in 0..400 {
+            if is_so(self.metric(start)) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(25));
+        }
+        panic!("metric {start} stays {}", self.metric(start));
+    }
 }
 
 impl Drop for Server {

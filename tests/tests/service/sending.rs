@@ -148,5 +148,5 @@ fn a_sender_that_is_stopped_closes_its_session() {
     stopper.join().unwrap();
     assert_eq!(report.frames, 1);
     server.wait_for_room("demo", |room| room.is_some_and(|room| room["publisher"].is_null()));
-    assert!(server.metric("rhytid_sessions_ended_total{reason=\"closed\"}") >= 1.0, "it said that it goes");
+    server.wait_for_metric("rhytid_sessions_ended_total{reason=\"closed\"}", |count| count >= 1.0);
 }

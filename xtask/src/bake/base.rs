@@ -3,6 +3,7 @@
 
 use super::obj::{Obj, parse_target};
 use super::source::Source;
+use super::weights::shape;
 use anyhow::{Result, ensure};
 use glam::Vec3;
 use rhytid_shared::ARKIT_NAMES;
@@ -25,13 +26,13 @@ const MACROS: [(&str, f32); 8] = [
 /// Expression shapes mixed into the neutral. The plain MakeHuman face reads as a frown (a tracker sees browDown 0.44),
 /// its lips come apart by half a millimetre when the mesh is subdivided, and its eyes are a little narrow.
 const NEUTRAL_SHAPES: [(&str, f32); 11] = [
-    ("eyeWideLeft", 0.12),
-    ("eyeWideRight", 0.12),
+    ("eyeWideLeft", 0.55),
+    ("eyeWideRight", 0.45),
+    ("eyeSquintLeft", -0.30),
+    ("eyeSquintRight", -0.15),
     ("browDownLeft", -0.50),
     ("browDownRight", -0.50),
     ("browInnerUp", 0.15),
-    ("browOuterUpLeft", 0.08),
-    ("browOuterUpRight", 0.08),
     ("mouthLowerDownLeft", -0.08),
     ("mouthLowerDownRight", -0.08),
     ("mouthUpperUpLeft", -0.06),
@@ -41,6 +42,9 @@ const NEUTRAL_SHAPES: [(&str, f32); 11] = [
 /// MakeHuman's `mouthClose` undoes a wholly open jaw. ARKit's is given by itself too, where that would turn the lower lip
 /// over the nose.
 const MOUTH_CLOSE_SHARE: f32 = 0.35;
+
+/// MakeHuman's `tongueOut` moves nothing but the tongue, through the lower lip: mouth and jaw open for it.
+const WITH_TONGUE_OUT: [(&str, f32); 3] = [("jawOpen", 0.40), ("mouthLowerDownLeft", 0.25), ("mouthLowerDownRight", 0.25)];
 
 /// Waves of the asymmetry: `(direction and wave number, radians a metre; phase; displacement, metres)`. Long waves, so
 /// that halves differ as halves of a face do and no feature is bent. Tuned by eye; the sum stays below 1.1 mm.
@@ -57,7 +61,7 @@ pub struct Base {
     pub obj: Obj,
     /// Neutral position of every vertex of the `.obj`.
     pub positions: Vec<Vec3>,
-    /// `morphs[shape]`: displacements of the vertices the shape moves, in [`ARKIT_NAMES`]' order.
+    /// `morphs[shape]`: displacements of the vertices the shape moves, in [`ARKIT_NAMES`]' order; those of one vertex add up.
     pub morphs: Vec<Vec<(u32, Vec3)>>,
 }
 
@@ -76,7 +80,7 @@ impl Base {
                 positions[v as usize] += delta * weight;
             }
         }
-        let mut morphs = Vec::with_capacity(ARKIT_NAMES.len());
+        let mut morphs: Vec<Vec<(u32, Vec3)>> = Vec::with_capacity(ARKIT_NAMES.len());
         for name in ARKIT_NAMES {
             let deltas = read(&format!("faceunits01/targets/faceunits/{name}.target"))?;
             if let Some(&(_, weight)) = NEUTRAL_SHAPES.iter().find(|(shape, _)| *shape == name) {
@@ -84,6 +88,11 @@ impl Base {
             }
             let share = if name == "mouthClose" { MOUTH_CLOSE_SHARE } else { 1.0 };
             morphs.push(deltas.into_iter().map(|(v, delta)| (v, delta * METRES_PER_UNIT * share)).collect());
+        }
+
+        for (name, share) in WITH_TONGUE_OUT {
+            let opening: Vec<(u32, Vec3)> = morphs[shape(name)].iter().map(|&(v, delta)| (v, delta * share)).collect();
+            morphs[shape("tongueOut")].extend(opening);
         }
 
         let eyes = mean(&positions, &[obj.vertices_of("helper-l-eye"), obj.vertices_of("helper-r-eye")].concat());
@@ -99,7 +108,7 @@ impl Base {
     /// Displacement of every vertex by one shape.
     pub fn dense_morph(&self, shape: usize) -> Vec<Vec3> {
         let mut dense = vec![Vec3::ZERO; self.positions.len()];
-        self.morphs[shape].iter().for_each(|&(v, delta)| dense[v as usize] = delta);
+        self.morphs[shape].iter().for_each(|&(v, delta)| dense[v as usize] += delta);
         dense
     }
 }

@@ -14,9 +14,9 @@ const LINE: [Vec2; 6] = [
     Vec2::new(0.0125, 0.0135),
     Vec2::new(0.0225, 0.0160),
     Vec2::new(0.0330, 0.0185),
-    Vec2::new(0.0430, 0.0190),
-    Vec2::new(0.0505, 0.0162),
-    Vec2::new(0.0565, 0.0110),
+    Vec2::new(0.0430, 0.0181),
+    Vec2::new(0.0505, 0.0149),
+    Vec2::new(0.0565, 0.0096),
 ];
 /// Half the brow's height along the line, metres.
 const HALF_HEIGHT: [f32; 6] = [0.0036, 0.0042, 0.0038, 0.0032, 0.0022, 0.0008];

@@ -45,20 +45,22 @@ pub const POSES: [PoseRecipe; 4] = [
             ("brow_mid", mm(-2.2, -5.6, 1.3)),
             ("brow_outer", mm(-1.4, -4.4, 1.0)),
             ("glabella", mm(0.0, -5.0, 1.4)),
-            ("nose_wing", mm(0.3, 0.8, 0.0)),
+            ("nose_wing", mm(0.3, 1.6, 0.0)),
         ],
     },
     PoseRecipe {
         name: "smile",
-        shapes: &[("mouthSmileLeft", 0.85), ("mouthSmileRight", 0.85), ("cheekSquintLeft", 0.6), ("cheekSquintRight", 0.6)],
-        bones: &["lip_corner", "lip_upper_outer", "lip_upper", "lip_lower_outer", "lip_lower", "cheek", "nasolabial"],
-        by_hand: &[("lip_corner", mm(1.5, -1.5, -0.5))],
+        // Only bones that a smile moves far and other expressions move elsewhere: the lips between the corners rise in a
+        // smile as they do in any raised lip. Segments are as long as the smiles people make before a camera.
+        shapes: &[("mouthSmileLeft", 0.62), ("mouthSmileRight", 0.62), ("cheekSquintLeft", 0.5), ("cheekSquintRight", 0.5)],
+        bones: &["lip_corner", "lip_lower_outer", "cheek", "nasolabial"],
+        by_hand: &[("lip_corner", mm(1.3, -1.0, 0.0))],
     },
     PoseRecipe {
         name: "pucker",
         shapes: &[("mouthPucker", 1.15), ("mouthShrugLower", 0.5)],
         bones: &["lip_corner", "lip_upper_outer", "lip_upper", "lip_upper_mid", "lip_lower_outer", "lip_lower", "lip_lower_mid", "chin"],
-        by_hand: &[("lip_corner", mm(-2.0, 0.0, 0.0)), ("chin", mm(0.0, 4.2, 0.4))],
+        by_hand: &[("lip_corner", mm(-2.0, 0.0, 0.0)), ("chin", mm(0.0, 5.8, 0.4))],
     },
 ];
 

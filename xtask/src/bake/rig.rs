@@ -96,7 +96,7 @@ const UPPER_LIP_GAIN: [f32; 3] = [1.2, 1.5, 1.0];
 /// The forehead's muscle draws the skin up to the hair line.
 const FRONTALIS: &[Pull] = &[pull(0.0, 20.0, 0.80, 34.0), pull(0.0, 38.0, 0.55, 34.0)];
 /// The ring muscle of the eye lifts the cheek and folds the skin beside the outer corner.
-const CROWS_FEET: &[Pull] = &[pull(21.0, 24.0, 0.95, 30.0)];
+const CROWS_FEET: &[Pull] = &[pull(21.0, 20.0, 0.75, 34.0)];
 
 const SKIN_BONES: [SkinBone; 16] = [
     also(bone("brow_inner", &[(22, 0.7), (23, 0.3)], &[(22, 0.7), (23, 0.3)], 0.052), FRONTALIS),

@@ -7,7 +7,7 @@ use super::bust::{Bust, Eyeball, PoseField, Region};
 use super::cut::cut_bust;
 use super::landmarks::{BROW, IBUG_VERTICES};
 use super::mesh::{Face, Mesh};
-use super::part::{Material, Part, sparse};
+use super::part::{Binding, Material, Part, sparse};
 use super::poses::POSES;
 use super::regions::{self, Masks};
 use super::rig::{Places, Rig};
@@ -31,6 +31,8 @@ pub struct Skin {
     pub regions: Vec<Region>,
     /// Landmarks on the neutral.
     pub ibug68: [Vec3; NUM_IBUG],
+    /// Vertices where the lips' inner edges meet, right and left.
+    pub lip_corners: [u32; 2],
     /// Left and right eye.
     pub eyes: [Eyeball; 2],
     /// Bones.
@@ -70,7 +72,8 @@ impl Skin {
             *landmark = *new_of.get(&base_vertex).with_context(|| format!("landmark vertex {base_vertex} was cut away"))?;
         }
         let lip_sides = lips::sides(&mesh, &landmark_vertices);
-        lips::seal(&mut mesh, &regions, &lip_sides, [landmark_vertices[60], landmark_vertices[64]]);
+        let lip_corners = [landmark_vertices[60], landmark_vertices[64]];
+        lips::seal(&mut mesh, &regions, &lip_sides, lip_corners);
         let landmarks = |mesh: &Mesh| landmark_vertices.map(|v| mesh.positions[v as usize]);
         let lids = lids::fields(&mesh, &regions, eyes, &landmarks(&mesh));
         lids::clear_the_ball(&mut mesh, &regions, eyes, &lids.fields);
@@ -103,6 +106,7 @@ impl Skin {
                 mesh: &mesh,
                 regions: &regions,
                 lips: &lip_sides,
+                lip_corners,
                 jaw,
                 lids: lids.fields,
                 jaw_pivot,
@@ -110,7 +114,7 @@ impl Skin {
             },
             &rig,
         );
-        Ok(Self { mesh, regions, ibug68, eyes, rig, weights })
+        Ok(Self { mesh, regions, ibug68, lip_corners, eyes, rig, weights })
     }
 
     /// Corners split at UV seams: `(vertex, uv)` of each drawn vertex, and the triangles over them.
@@ -157,10 +161,15 @@ impl Skin {
     pub fn for_painter(&self) -> Bust {
         let (corners, triangles) = self.split();
         let normals = self.mesh.normals(&self.mesh.positions);
+        let bindings = weights::bind(&self.weights);
         let poses = POSES.iter().map(|recipe| {
             let moved = recipe.displacements(&self.mesh, &self.rig);
             let joints: Vec<u8> = moved.keys().map(|name| self.rig.joint_of(name)).collect();
-            let share = |v: u32| self.weights[v as usize].iter().filter(|(joint, _)| joints.contains(joint)).map(|&(_, w)| w).sum();
+            let share = |v: u32| {
+                let Binding { joints: bound, weights } = bindings[v as usize];
+                let of_pose = bound.iter().zip(weights).filter(|(joint, _)| joints.contains(joint));
+                of_pose.map(|(_, weight)| f32::from(weight)).sum::<f32>() / 255.0
+            };
             PoseField { name: recipe.name, influence: corners.iter().map(|&(v, _)| share(v)).collect() }
         });
         let positions: Vec<Vec3> = corners.iter().map(|&(v, _)| self.mesh.positions[v as usize]).collect();

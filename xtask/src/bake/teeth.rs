@@ -6,6 +6,7 @@ use super::part::{Binding, Material, Part, sparse};
 use super::random::Random;
 use super::rig::HEAD;
 use super::subdivide::subdivide;
+use super::weights::{shape, smoothstep};
 use glam::{Vec2, Vec3};
 use rhytid_shared::ARKIT_NAMES;
 use std::f32::consts::TAU;
@@ -43,25 +44,24 @@ const LOWER: [Crown; 7] = [
     crown(10.2, 6.9, 9.6, 0.05),
 ];
 
-/// Outer line of the arch from the middle backwards, in shares of the helper bar's half width and depth.
-const ARCH: [Vec2; 9] = [
-    Vec2::new(0.0, 0.975),
-    Vec2::new(0.277, 0.945),
-    Vec2::new(0.535, 0.860),
-    Vec2::new(0.685, 0.732),
-    Vec2::new(0.790, 0.577),
-    Vec2::new(0.872, 0.408),
-    Vec2::new(0.917, 0.274),
-    Vec2::new(0.955, 0.142),
-    Vec2::new(0.975, 0.0),
-];
+/// Outer line of an arch from the middle backwards: millimetres from the middle, and behind the foremost point.
+type Line = [(f32, f32); 10];
 
-/// How far inside the helper bar the outer surface lies and how far the edges overlap, metres.
+/// Cusps of the canines 34 mm apart, of the first molars about 50 (means of grown people): the helper bars are as wide as
+/// the mouth, and teeth as wide as that would stand out of its corners.
+const UPPER_LINE: Line =
+    [(0.0, 0.0), (4.5, 0.3), (8.8, 1.4), (13.8, 3.8), (17.4, 7.8), (19.8, 13.6), (22.2, 20.6), (24.6, 29.0), (26.6, 39.0), (27.6, 47.0)];
+/// Canines 26 mm apart, first molars about 44.
+const LOWER_LINE: Line =
+    [(0.0, 0.0), (4.0, 0.3), (7.8, 1.5), (11.2, 4.0), (14.0, 7.8), (16.6, 13.5), (19.2, 20.5), (22.0, 29.5), (24.4, 39.5), (25.6, 48.0)];
+
+/// How far behind the helper bar's front the outer surface lies, metres.
 const UPPER_INSET: f32 = 0.000_6;
-const LOWER_INSET: f32 = 0.002_8;
-const OVERBITE: f32 = 0.001_2;
-/// How much lower than the helper bars the teeth stand, metres: the upper ones must show below a parted upper lip.
-const DROP: f32 = 0.002_2;
+const LOWER_INSET: f32 = 0.002_9;
+/// How much lower than the helper bars' meeting plane the edges stand, metres. The upper incisors show below a parted
+/// upper lip, the lower ones stay behind the lower lip.
+const UPPER_DROP: f32 = 0.005_4;
+const LOWER_DROP: f32 = 0.005_6;
 /// How far crowns reach into the gum, metres.
 const BURIED: f32 = 0.002_0;
 /// How far the gum reaches beyond the crowns' necks, metres.
@@ -70,40 +70,45 @@ const GUM_HEIGHT: f32 = 0.008;
 const NUM_AROUND: u32 = 12;
 /// Heights of a crown's rings, root to edge, with their size: width, depth.
 const RINGS: [(f32, f32, f32); 8] = [
-    (0.00, 0.74, 0.86),
-    (0.20, 0.84, 0.98),
-    (0.42, 0.94, 1.00),
+    (0.00, 0.86, 0.88),
+    (0.20, 0.92, 0.98),
+    (0.42, 0.97, 1.00),
     (0.64, 1.00, 0.92),
     (0.82, 1.00, 0.80),
-    (0.93, 0.97, 0.66),
-    (0.985, 0.90, 0.52),
-    (1.0, 0.74, 0.36),
+    (0.93, 0.96, 0.66),
+    (0.985, 0.87, 0.52),
+    (1.0, 0.70, 0.36),
 ];
 
 /// One dental arch in the frame of the head.
 struct Arch {
     low: Vec3,
     high: Vec3,
+    line: &'static Line,
     inset: f32,
+    drop: f32,
     /// -1 for the upper jaw, whose crowns grow down.
     up: f32,
 }
 
 impl Arch {
-    fn new(base: &Base, group: &str, inset: f32, up: f32) -> Self {
-        let points = base.obj.vertices_of(group).into_iter().map(|v| base.positions[v as usize]);
-        let (low, high) = points.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)));
-        Self { low, high, inset, up }
+    fn upper(base: &Base) -> Self {
+        let (low, high) = bounds(base, UPPER_BAR);
+        Self { low, high, line: &UPPER_LINE, inset: UPPER_INSET, drop: UPPER_DROP, up: -1.0 }
+    }
+
+    fn lower(base: &Base) -> Self {
+        let (low, high) = bounds(base, LOWER_BAR);
+        Self { low, high, line: &LOWER_LINE, inset: LOWER_INSET, drop: LOWER_DROP, up: 1.0 }
     }
 
     /// Point of the outer line; `u` -1 to 1 from the right end over the middle to the left one.
     fn outer(&self, u: f32) -> Vec2 {
-        let x = u.abs().min(1.0) * (ARCH.len() - 1) as f32;
-        let i = (x as usize).min(ARCH.len() - 2);
-        let p = ARCH[i].lerp(ARCH[i + 1], x - i as f32);
+        let x = u.abs().min(1.0) * (self.line.len() - 1) as f32;
+        let i = (x as usize).min(self.line.len() - 2);
+        let p = Vec2::from(self.line[i]).lerp(Vec2::from(self.line[i + 1]), x - i as f32) * 1e-3;
         let middle = 0.5 * (self.low.x + self.high.x);
-        let half = 0.5 * (self.high.x - self.low.x) - self.inset;
-        Vec2::new(middle + u.signum() * p.x * half, self.low.z + p.y * (self.high.z - self.inset - self.low.z))
+        Vec2::new(middle + u.signum() * p.x, self.high.z - self.inset - p.y)
     }
 
     /// Samples of the outer line: place and length from the middle, one side.
@@ -126,8 +131,16 @@ impl Arch {
         let t = (z - self.low.z) / (self.high.z - self.low.z);
         let front = if self.up < 0.0 { self.low.y } else { self.high.y - 0.22 * (self.high.y - self.low.y) };
         let back = if self.up < 0.0 { self.low.y + 0.30 * (self.high.y - self.low.y) } else { self.high.y };
-        back + (front - back) * t + self.up * OVERBITE - DROP
+        back + (front - back) * t - self.drop
     }
+}
+
+const UPPER_BAR: &str = "helper-upper-teeth";
+const LOWER_BAR: &str = "helper-lower-teeth";
+
+fn bounds(base: &Base, group: &str) -> (Vec3, Vec3) {
+    let points = base.obj.vertices_of(group).into_iter().map(|v| base.positions[v as usize]);
+    points.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)))
 }
 
 /// Both rows of teeth with their gums.
@@ -142,11 +155,8 @@ pub fn build(base: &Base, jaw: u8) -> Part {
         morphs: vec![Vec::new(); ARKIT_NAMES.len()],
         triangles: Vec::new(),
     };
-    for (group, crowns, joint, inset, up) in
-        [("helper-upper-teeth", &UPPER, HEAD, UPPER_INSET, -1.0), ("helper-lower-teeth", &LOWER, jaw, LOWER_INSET, 1.0)]
-    {
+    for (arch, group, crowns, joint) in [(Arch::upper(base), UPPER_BAR, &UPPER, HEAD), (Arch::lower(base), LOWER_BAR, &LOWER, jaw)] {
         let first = part.positions.len() as u32;
-        let arch = Arch::new(base, group, inset, up);
         row(&mut part, &arch, crowns);
         part.bindings.resize(part.positions.len(), Binding::rigid(joint));
         carry(&mut part, base, group, first);
@@ -162,9 +172,9 @@ fn row(part: &mut Part, arch: &Arch, crowns: &[Crown; 7]) {
     for side in [-1.0, 1.0] {
         let samples = arch.lengths(side);
         let whole: f32 = crowns.iter().map(|crown| crown.width).sum();
-        let scale = (samples[samples.len() - 1].1 / whole).min(1.12);
+        let scale = (samples[samples.len() - 1].1 / whole).min(1.0);
         let mut from = 0.0;
-        for crown in crowns {
+        for (number, crown) in crowns.iter().enumerate() {
             let width = crown.width * scale;
             let at = |length: f32| samples.iter().find(|sample| sample.1 >= length).map_or(samples[samples.len() - 1].0, |sample| sample.0);
             let (start, end, middle) = (at(from), at(from + width), at(from + 0.5 * width));
@@ -178,8 +188,11 @@ fn row(part: &mut Part, arch: &Arch, crowns: &[Crown; 7]) {
             let edge = arch.edge(middle.y) + 0.000_35 * random.signed();
             let height = crown.height * (1.0 + 0.03 * random.signed());
             let neck = Vec3::new(middle.x, edge - arch.up * height, middle.y) - outwards * (0.5 * crown.depth + 0.000_3 * random.unit());
+            let first = part.uvs.len();
             necks.push((neck + outwards * 0.5 * crown.depth, outwards, crown.depth));
             push_crown(part, crown, neck, [along, Vec3::Y * arch.up, outwards], width * 0.985, height);
+            // Each has its own stripe of the picture: the further back, the less light comes in.
+            part.uvs[first..].iter_mut().for_each(|uv| uv.x = (number as f32 + 0.1 + 0.8 * uv.x) / crowns.len() as f32);
         }
         if side < 0.0 {
             necks.reverse();
@@ -226,9 +239,11 @@ fn push_crown(part: &mut Part, crown: &Crown, neck: Vec3, frame: [Vec3; 3], widt
 
 /// The gum: a band round the necks, drawn out between the crowns and back over each of them.
 fn gum(part: &mut Part, necks: &[(Vec3, Vec3, f32)], up: f32) {
-    const STEPS: usize = 4;
+    const STEPS: usize = 6;
     /// Across the band from the lip's side over the ridge to the tongue's: outwards in half depths, towards the root in metres.
     const PROFILE: [(f32, f32); 7] = [(1.00, 1.0), (1.12, 0.55), (1.08, 0.15), (0.72, -0.02), (-0.9, -0.02), (-1.18, 0.2), (-1.1, 1.0)];
+    /// How far the gum reaches up between two crowns, counted from the last molar, metres.
+    const PAPILLA: [f32; 5] = [0.001_6, 0.001_8, 0.002_2, 0.002_8, 0.003_2];
     let first = part.positions.len() as u32;
     let num_columns = (necks.len() - 1) * STEPS + 1;
     for column in 0..num_columns {
@@ -236,7 +251,10 @@ fn gum(part: &mut Part, necks: &[(Vec3, Vec3, f32)], up: f32) {
         let (a, b) = (necks[i], necks[(i + 1).min(necks.len() - 1)]);
         let (at, outwards, depth) = (a.0.lerp(b.0, f), a.1.lerp(b.1, f).normalize(), a.2 + (b.2 - a.2) * f);
         let between = libm::sinf(std::f32::consts::PI * f);
-        let papilla = 0.001_9 * between * between - 0.000_2;
+        let between = between * between;
+        // It fills what the crowns leave open down to where they touch; between molars that is less.
+        let from_end = i.min((necks.len() - 2).saturating_sub(i)).min(PAPILLA.len() - 1);
+        let papilla = PAPILLA[from_end] * between * between - 0.000_2;
         let middle = at - outwards * 0.5 * depth;
         for (p, (out, root)) in PROFILE.into_iter().enumerate() {
             let drop = if root > 0.9 { -GUM_HEIGHT } else { papilla - root * 0.006 };
@@ -312,6 +330,11 @@ fn smooth_normals(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<Vec3> {
 /// bound to the jaw.
 pub fn tongue(base: &Base, jaw: u8) -> Part {
     const FLATNESS: f32 = 0.66;
+    /// It lies inside the lower arch: narrower than the helper, and its tip behind the incisors.
+    const NARROWNESS: f32 = 0.78;
+    const SHORTNESS: f32 = 0.90;
+    /// What it is shorter by it must reach further to come out.
+    const STRETCH: f32 = 1.35;
     let polygons = &base.obj.groups["helper-tongue"];
     let mut coarse = Mesh {
         positions: base.positions.clone(),
@@ -323,11 +346,18 @@ pub fn tongue(base: &Base, jaw: u8) -> Part {
             .collect(),
     };
     coarse.compact();
-    let bottom = coarse.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
+    let (low, high) = coarse.positions.iter().fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), &p| (low.min(p), high.max(p)));
+    let fixed = Vec3::new(0.5 * (low.x + high.x), low.y, low.z);
     for position in &mut coarse.positions {
-        position.y = bottom + (position.y - bottom) * FLATNESS;
+        *position = fixed + (*position - fixed) * Vec3::new(NARROWNESS, FLATNESS, SHORTNESS);
     }
-    let mesh = subdivide(&coarse);
+    let mut mesh = subdivide(&coarse);
+    for (position, out) in mesh.positions.iter().zip(&mut mesh.morphs[shape("tongueOut")]) {
+        // Over the lower teeth and lip, and down again in front of them.
+        out.z *= STRETCH;
+        let reached = position.z + out.z;
+        out.y += 0.008 * smoothstep(0.045, 0.068, reached) - 0.006 * smoothstep(0.078, 0.096, reached);
+    }
     let mut uvs = vec![Vec2::ZERO; mesh.positions.len()];
     for face in &mesh.faces {
         face.vertices.iter().zip(&face.uvs).for_each(|(&v, &t)| uvs[v as usize] = mesh.uvs[t as usize]);

@@ -9,6 +9,7 @@ use super::part::Binding;
 use super::rig::{HEAD, ROOT, Reach, Rig, Zone};
 use glam::{Vec3, Vec3Swizzles};
 use rhytid_shared::ARKIT_NAMES;
+use std::collections::BTreeMap;
 
 /// Which side of the mouth a vertex is on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,6 +28,8 @@ pub struct Skin<'a> {
     pub regions: &'a [Region],
     /// Side of the mouth of every vertex.
     pub lips: &'a [Lip],
+    /// Vertices where the lips' inner edges meet.
+    pub lip_corners: [u32; 2],
     /// Share of the jaw's turn of every vertex.
     pub jaw: Vec<f32>,
     /// Hinge of the jaw.
@@ -40,7 +43,17 @@ pub struct Skin<'a> {
 /// How much more firmly weights are held to the automatic rig's where an echo speaks.
 const ECHO_HOLD: f32 = 30.0;
 
-/// Weights of every vertex over the joints, summing to one, before they are cut to four.
+/// How far from the lips' inner corners along the skin both lips move as one, and where they are wholly apart, metres.
+const CORNER_RANGE: [f32; 2] = [0.002_5, 0.008];
+
+/// Joints a vertex of the file can have.
+const NUM_KEPT: usize = 4;
+/// Smaller weights do not show.
+const LEAST_WEIGHT: f32 = 0.004;
+/// Distance along the skin in which a joint fades out before it is dropped, metres. Tuned by eye: shorter creases show.
+const FADE_LENGTH: f32 = 0.009;
+
+/// Weights of every vertex over at most four joints, summing to one.
 pub type Weights = Vec<Vec<(u8, f32)>>;
 
 /// Height, tilted forwards, over which the neck passes from the torso (0) to the head (1), metres.
@@ -73,7 +86,7 @@ pub fn build(skin: &Skin<'_>, rig: &Rig) -> Weights {
     let fields = skin_fields(skin, rig, &graph);
     let jaw = rig.joint_of("jaw");
     let lid_joints = [["lid_upper_l", "lid_lower_l"], ["lid_upper_r", "lid_lower_r"]].map(|pair| pair.map(|name| rig.joint_of(name)));
-    (0..skin.mesh.positions.len())
+    let mut weights: Weights = (0..skin.mesh.positions.len())
         .map(|v| {
             let mut weights: Vec<(u8, f32)> = Vec::new();
             let mut left = 1.0;
@@ -96,7 +109,58 @@ pub fn build(skin: &Skin<'_>, rig: &Rig) -> Weights {
             weights.retain(|&(_, weight)| weight > 0.0);
             weights
         })
-        .collect()
+        .collect();
+    keep_four(&graph, &mut weights);
+    // Where three joints faded at once the fourth took over steeply. Lids and lips are left as their shapes have them.
+    let is_open = |v: usize| matches!(skin.regions[v], Region::Face | Region::Body);
+    smooth_all(&graph, &mut weights, is_open);
+    weights
+}
+
+/// Smooths the weights of all joints over the vertices `is_open`, and leaves each its four heaviest.
+fn smooth_all(graph: &[Vec<(u32, f32)>], weights: &mut Weights, is_open: impl Fn(usize) -> bool) {
+    const NUM_ROUNDS: usize = 6;
+    let num_joints = weights.iter().flatten().map(|&(joint, _)| joint + 1).max().unwrap_or(0);
+    let mut smoothed: Weights = vec![Vec::new(); weights.len()];
+    for joint in 0..num_joints {
+        let of = |list: &Vec<(u8, f32)>| list.iter().find(|(own, _)| *own == joint).map_or(0.0, |&(_, weight)| weight);
+        let mut field: Vec<f32> = weights.iter().map(of).collect();
+        autorig::smooth(graph, &mut field, NUM_ROUNDS, |a, b| is_open(a) && is_open(b));
+        smoothed.iter_mut().zip(field).filter(|(_, weight)| *weight > LEAST_WEIGHT).for_each(|(list, weight)| list.push((joint, weight)));
+    }
+    for list in &mut smoothed {
+        list.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        list.truncate(NUM_KEPT);
+        let sum: f32 = list.iter().map(|&(_, weight)| weight).sum();
+        list.iter_mut().for_each(|(_, weight)| *weight /= sum);
+    }
+    *weights = smoothed;
+}
+
+/// Leaves each vertex its four heaviest joints. A joint fades out along the skin towards where it is dropped: cut off at
+/// once, its missing gradient would stand as a dark spot in the normals, which bend with the weights.
+fn keep_four(graph: &[Vec<(u32, f32)>], weights: &mut Weights) {
+    for list in weights.iter_mut() {
+        list.retain(|&(_, weight)| weight > LEAST_WEIGHT);
+        list.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+    }
+    let mut dropped_at: BTreeMap<u8, Vec<u32>> = BTreeMap::new();
+    for (v, list) in weights.iter_mut().enumerate() {
+        for (joint, _) in list.drain(list.len().min(NUM_KEPT)..) {
+            dropped_at.entry(joint).or_default().push(v as u32);
+        }
+    }
+    for (joint, places) in dropped_at {
+        let distances = autorig::distances(graph, &places, FADE_LENGTH);
+        for (list, distance) in weights.iter_mut().zip(distances).filter(|(_, distance)| distance.is_finite()) {
+            let share = smoothstep(0.0, FADE_LENGTH, distance).max(1e-3);
+            list.iter_mut().filter(|(own, _)| *own == joint).for_each(|(_, weight)| *weight *= share);
+        }
+    }
+    for list in weights.iter_mut() {
+        let sum: f32 = list.iter().map(|&(_, weight)| weight).sum();
+        list.iter_mut().for_each(|(_, weight)| *weight /= sum);
+    }
 }
 
 /// Weights of the skin bones and, last, of the jaw: automatic rig first, then fitted to the shapes, then smoothed.
@@ -139,6 +203,16 @@ fn skin_fields(skin: &Skin<'_>, rig: &Rig, graph: &[Vec<(u32, f32)>]) -> Vec<Vec
     for field in &mut fields {
         autorig::smooth(graph, field, 4, is_same);
     }
+    // A corner that lifts while only one lip follows it would gape: there both move as one piece.
+    for corner in skin.lip_corners {
+        let distances = autorig::distances(graph, &[corner], CORNER_RANGE[1]);
+        for field in &mut fields {
+            let whole = field[corner as usize];
+            for (weight, &distance) in field.iter_mut().zip(&distances) {
+                *weight += (whole - *weight) * (1.0 - smoothstep(CORNER_RANGE[0], CORNER_RANGE[1], distance));
+            }
+        }
+    }
     fields
 }
 
@@ -163,4 +237,31 @@ pub fn smoothstep(low: f32, high: f32, x: f32) -> f32 {
 /// Cuts to four and quantises.
 pub fn bind(weights: &Weights) -> Vec<Binding> {
     weights.iter().map(|weights| Binding::from_weights(weights.clone())).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn joints_fade_out_before_they_are_dropped() {
+        // A line of vertices a millimetre apart on which a fifth joint comes up and takes over from the fourth.
+        let num = 60_u32;
+        let graph: Vec<Vec<(u32, f32)>> =
+            (0..num).map(|v| [v.wrapping_sub(1), v + 1].into_iter().filter(|&u| u < num).map(|u| (u, 0.001)).collect()).collect();
+        let mut weights: Weights = (0..num)
+            .map(|v| {
+                let rising = 0.2 * v as f32 / num as f32;
+                vec![(0, 0.3), (1, 0.3), (2, 0.2), (3, 0.2 - rising), (4, rising)]
+            })
+            .collect();
+        keep_four(&graph, &mut weights);
+        let of = |v: usize, joint: u8| weights[v].iter().find(|(known, _)| *known == joint).map_or(0.0, |&(_, weight)| weight);
+        for v in 0..num as usize {
+            assert!(weights[v].len() <= 4 && (weights[v].iter().map(|w| w.1).sum::<f32>() - 1.0).abs() < 1e-5);
+            if v > 0 {
+                assert!((0..5).all(|joint| (of(v, joint) - of(v - 1, joint)).abs() < 0.05), "a step at {v}");
+            }
+        }
+    }
 }

@@ -28,6 +28,8 @@ pub struct Marks {
     pub lip_rim: f32,
     /// Between the lips, where they touch.
     pub lip_gap: f32,
+    /// Round the corners of the mouth, inside and out.
+    pub lip_corner: f32,
     /// Upper lid up to its crease.
     pub upper_lid: f32,
     /// Hollow under the eye.
@@ -134,6 +136,8 @@ impl<'a> Features<'a> {
     }
 
     fn mark_lips(&self, marks: &mut Marks, at: Vec2, place: Vec3) {
+        let corner = if place.x >= 0.0 { 64 } else { 60 };
+        marks.lip_corner = smoothstep(9.0, 3.0, (place - self.chart.landmark(corner)).length());
         let mouth = self.chart.middle(&[48, 54, 62, 66]);
         if (at - self.chart.unroll(mouth)).length() > 55.0 || marks.mouth > 0.99 {
             return;

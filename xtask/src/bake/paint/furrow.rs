@@ -33,6 +33,9 @@ pub struct Stroke {
     pub stray: f32,
     /// Fine lines beside it.
     pub companions: usize,
+    /// A fold instead of a furrow: the skin on the fuller side of `lean` rolls over the other, `shoulder` away at its
+    /// highest, and falls back gently beyond; the other side meets it flat, within about two widths.
+    pub is_fold: bool,
     /// Of its irregularities.
     pub seed: u32,
 }
@@ -51,6 +54,7 @@ impl Stroke {
             broken: 0.25,
             stray: 0.8,
             companions: 0,
+            is_fold: false,
             seed,
         }
     }
@@ -65,6 +69,8 @@ struct Node {
     shoulder: f32,
     bulge: f32,
     lean: f32,
+    /// Of a fold: height of the roll, mm, with the sign of its side; 0 for a furrow.
+    roll: f32,
 }
 
 /// Furrows on the skin: a height field.
@@ -118,6 +124,11 @@ impl Furrows {
         let (across, shoulder) = (distance.sqrt(), mix(|n| n.shoulder));
         // The far side of a thin fold (a lip, a lid, a nostril) is near in space but faces elsewhere.
         let same_side = smoothstep(-0.1, 0.4, normal.dot(a.normal));
+        let roll = mix(|n| n.roll);
+        if roll != 0.0 {
+            let into_roll = side * roll.signum() * across;
+            return same_side * fold(into_roll, mix(|n| n.width), shoulder, mix(|n| n.depth), roll.abs());
+        }
         let valley = profile(across, mix(|n| n.width));
         let crest = crest(across, shoulder) * mix(|n| n.bulge) * (1.0 + side * mix(|n| n.lean) * smoothstep(0.0, 1.0, across / shoulder));
         mix(|n| n.depth) * same_side * (crest - valley)
@@ -142,9 +153,24 @@ impl Furrows {
             let gaps = 1.0 - stroke.broken * smoothstep(0.1, 0.75, 0.5 + 0.7 * wave(11.0, 4) + 0.3 * wave(4.0, 5));
             let uneven = (1.0 + 0.3 * wave(8.0, 6) + 0.15 * wave(2.5, 7)).max(0.2);
             let thin = 0.55 + 0.45 * taper;
+            if stroke.is_fold {
+                // One clear line and a roll as smooth as flesh: unevenness of a furrow would look like a scar here.
+                run.push(Node {
+                    place,
+                    normal,
+                    depth: stroke.depth * taper * gaps * (1.0 + 0.14 * wave(13.0, 6)),
+                    width: stroke.width * (1.0 + 0.15 * wave(10.0, 8)),
+                    shoulder: stroke.shoulder * (0.7 + 0.3 * taper) * (1.0 + 0.12 * wave(26.0, 9)),
+                    bulge: stroke.bulge,
+                    lean: stroke.lean,
+                    roll: stroke.depth * stroke.bulge * taper.max(1e-3) * (1.0 + 0.15 * wave(30.0, 10)) * stroke.lean.signum(),
+                });
+                continue;
+            }
             run.push(Node {
                 place,
                 normal,
+                roll: 0.0,
                 depth: stroke.depth * taper * gaps * uneven,
                 width: stroke.width * thin * (1.0 + 0.25 * wave(6.0, 8)),
                 shoulder: stroke.shoulder * (0.75 + 0.25 * taper) * (1.0 + 0.25 * wave(14.0, 9)),
@@ -161,7 +187,7 @@ impl Furrows {
         }
         let line = self.lines.len() as u32;
         for (index, pair) in nodes.windows(2).enumerate() {
-            let reach = Vec3::splat(reach(pair[0].shoulder.max(pair[1].shoulder), pair[0].width.max(pair[1].width)));
+            let reach = Vec3::splat(pair.iter().map(reach).fold(0.0, f32::max));
             let low = cell(pair[0].place.min(pair[1].place) - reach);
             let high = cell(pair[0].place.max(pair[1].place) + reach);
             for z in low[2]..=high[2] {
@@ -189,8 +215,24 @@ fn crest(across: f32, shoulder: f32) -> f32 {
     if t < 1.0 { smoothstep(0.0, 1.0, t) } else { smoothstep(2.4, 1.0, t) }
 }
 
-fn reach(shoulder: f32, width: f32) -> f32 {
-    (2.4 * shoulder).max(4.0 * width)
+/// A fold across its line: `into_roll` is the distance, negative on the flat side. `-depth` on the line, `roll` where the
+/// skin is fullest, 0 far away. Both sides meet in an edge: that is the line one sees.
+fn fold(into_roll: f32, width: f32, shoulder: f32, depth: f32, roll: f32) -> f32 {
+    if into_roll <= 0.0 {
+        let t = -into_roll / width;
+        return -depth * libm::expf(-t) * smoothstep(FOLD_FLAT, 0.6 * FOLD_FLAT, t);
+    }
+    let t = into_roll / shoulder;
+    if t < 1.0 { (depth + roll) * (1.0 - libm::powf(1.0 - t, 2.2)) - depth } else { roll * smoothstep(FOLD_ROLL, 1.0, t) }
+}
+
+/// Where a fold ends on either side, in widths and in shoulders.
+const FOLD_FLAT: f32 = 5.0;
+const FOLD_ROLL: f32 = 3.2;
+
+fn reach(node: &Node) -> f32 {
+    let (shoulders, widths) = if node.roll == 0.0 { (2.4, 4.0) } else { (FOLD_ROLL, FOLD_FLAT) };
+    (shoulders * node.shoulder).max(widths * node.width)
 }
 
 fn cell(place: Vec3) -> [i32; 3] {
@@ -244,8 +286,25 @@ fn companions(stroke: &Stroke) -> Vec<Stroke> {
                 broken: 0.5,
                 stray: stroke.stray * 0.7,
                 companions: 0,
+                is_fold: false,
                 seed: stroke.seed.wrapping_mul(977).wrapping_add(i as u32 + 1),
             }
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fold_rolls_high_over_one_side_and_meets_the_other_flat() {
+        let height = |into_roll: f32| fold(into_roll, 1.7, 5.6, 1.5, 0.8);
+        assert!((height(0.0) + 1.5).abs() < 1e-6 && (height(5.6) - 0.8).abs() < 1e-5);
+        assert!((0..400).all(|i| height(-0.05 * i as f32) <= 0.0), "no welt on the flat side");
+        assert_eq!((height(-9.0), height(18.0)), (0.0, 0.0));
+        // Without a step, and nowhere steeper than the line itself.
+        let slope = |at: f32| (height(at + 0.01) - height(at)) / 0.01;
+        assert!((-900..1800).map(|i| slope(0.01 * i as f32).abs()).all(|slope| slope < 0.95));
+    }
 }

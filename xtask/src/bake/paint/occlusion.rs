@@ -15,6 +15,9 @@ const DEPTH_SIZE: usize = 576;
 /// What lies less than this behind the nearest surface is lit, mm.
 const BIAS: f32 = 1.6;
 
+/// Least light at the corners of the mouth.
+const CORNER_LIGHT: f32 = 0.5;
+
 /// Share of the sky seen from each texel, cosine-weighted.
 pub struct Openness {
     size: usize,
@@ -57,7 +60,9 @@ pub fn paint(atlas: &Atlas, features: &Features, openness: &Openness) -> Result<
         // A gamma below 1: what is shut off from the sky still gets light from the skin around it.
         let marks = features.marks(texel);
         // Short hair lies in its own shadow.
-        [libm::powf(openness.at(texel.uv), 0.75) * (1.0 - 0.25 * marks.hair), roughness(texel, &marks)]
+        let lit = libm::powf(openness.at(texel.uv), 0.75) * (1.0 - 0.25 * marks.hair);
+        // At rest the corners of the mouth are shut; they are seen when they have opened.
+        [lit.max(CORNER_LIGHT * marks.lip_corner), roughness(texel, &marks)]
     });
     let code = |x: f32| (x.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
     let rgb: Vec<u8> = fill_gaps(size, &texels).iter().flat_map(|t| [code(t[0]), code(t[1]), 0]).collect();

@@ -20,6 +20,7 @@ const HAIR_SRGB: [u8; 3] = [43, 30, 23];
 const STUBBLE_SRGB: [u8; 3] = [80, 72, 72];
 const LIP_SRGB: [u8; 3] = [172, 106, 95];
 const MOUTH_SRGB: [u8; 3] = [112, 46, 44];
+const CORNER_SRGB: [u8; 3] = [150, 82, 72];
 const WATERLINE_SRGB: [u8; 3] = [214, 150, 138];
 const NOSTRIL_SRGB: [u8; 3] = [74, 34, 27];
 
@@ -76,7 +77,8 @@ fn color(features: &Features, texel: &Texel, marks: &Marks, moles: &[(Vec3, f32,
     let nostril = bell(((p - nose) / Vec3::new(14.0, 11.0, 14.0)).length(), 1.0) * smoothstep(0.30, 0.12, openness);
     color = color.lerp(rgb(NOSTRIL_SRGB), 0.9 * nostril.min(1.0));
     let mouth = rgb(MOUTH_SRGB) * (1.0 + 0.25 * fractal(p / 4.0, 2, 21));
-    color = color.lerp(mouth, marks.mouth);
+    // A corner that opens a little shows flesh that light gets through, not a hole.
+    color = color.lerp(mouth.lerp(rgb(CORNER_SRGB), marks.lip_corner), marks.mouth);
     color.lerp(rgb([188, 110, 100]), marks.socket)
 }
 

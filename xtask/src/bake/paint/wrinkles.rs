@@ -214,15 +214,16 @@ fn compress(pen: &mut Pen) {
         pen.line(side, &[(42, -1.0, -4.0), (42, 4.0, -8.5), (47, 0.0, -8.0)], 0.42, 0.8, |s| s.companions = 3);
         pen.line(side, &[(42, -2.5, -8.0), (42, 2.5, -13.0), (47, -1.0, -13.0)], 0.34, 0.8, |s| s.companions = 2);
         // The raised wing: its crease, and the fold that starts there.
-        pen.line(side, &[(35, 0.0, 15.5), (35, 6.0, 12.0), (35, 8.0, 5.0), (35, 6.0, -1.0)], 0.75, 0.8, |s| {
+        pen.line(side, &[(35, 0.0, 15.5), (35, 6.0, 12.0), (35, 8.0, 5.0), (35, 6.0, -1.0)], 0.42, 0.8, |s| {
             s.lean = -0.4;
             s.shoulder = 3.0;
             s.broken = 0.1;
         });
-        pen.line(side, &[(35, 5.0, 12.0), (35, 11.0, 5.0), (35, 16.0, -3.0), (54, 4.0, 8.0)], 0.7, 1.1, |s| {
-            s.lean = 0.5;
+        pen.line(side, &[(35, 5.0, 12.0), (35, 11.0, 5.0), (35, 16.0, -3.0), (54, 9.0, 7.0)], 0.6, 1.5, |s| {
+            s.is_fold = true;
+            s.lean = side.sign();
             s.shoulder = 5.0;
-            s.taper = (0.15, 0.6);
+            s.taper = (0.2, 0.6);
         });
     }
     for (height, depth, half) in [(3.2, 0.75, 8.5), (-0.8, 0.6, 7.5), (-4.6, 0.36, 6.0)] {
@@ -260,24 +261,26 @@ fn smile(pen: &mut Pen) {
     pen.seed = 500;
     for side in Side::BOTH {
         let outward = side.sign();
-        let fold = [(35, 4.0, 9.0), (35, 9.0, 2.5), (35, 14.0, -6.0), (54, 8.0, 4.5), (54, 9.5, -4.0), (54, 8.5, -12.0)];
-        pen.line(side, &fold, 1.45, 1.5, |s| {
-            s.shoulder = 6.0;
-            s.bulge = 0.6;
-            s.lean = 0.6 * outward;
-            s.taper = (0.16, 0.4);
-            s.broken = 0.03;
-            s.stray = 0.45;
-            s.companions = 1;
+        // From beside the wing of the nose round the corner of the mouth, the cheek rolling over the lip.
+        let line = [(35, 5.5, 9.5), (35, 10.5, 3.0), (35, 15.0, -5.5), (54, 10.5, 6.5), (54, 11.5, -1.5), (54, 9.5, -9.5)];
+        pen.line(side, &line, 1.5, 1.7, |s| {
+            s.is_fold = true;
+            s.lean = outward;
+            s.shoulder = 5.6;
+            s.bulge = 0.55;
+            s.taper = (0.14, 0.5);
+            s.broken = 0.18;
+            s.stray = 0.5;
         });
-        pen.line(side, &[(54, 15.0, 11.0), (54, 17.5, 2.0), (54, 17.0, -8.0), (54, 13.5, -17.0)], 0.5, 1.2, |s| {
-            s.shoulder = 5.0;
-            s.lean = 0.5 * outward;
-            s.companions = 1;
+        // A second, short one where the cheek is pushed up against itself.
+        pen.line(side, &[(54, 19.5, 5.0), (54, 21.0, -2.0), (54, 19.5, -10.0)], 0.42, 1.3, |s| {
+            s.is_fold = true;
+            s.lean = outward;
+            s.shoulder = 4.2;
+            s.bulge = 0.4;
+            s.taper = (0.45, 0.5);
         });
-        pen.line(side, &[(54, 23.0, 6.0), (54, 24.5, -2.0), (54, 23.0, -11.0)], 0.28, 1.1, |s| s.shoulder = 4.5);
-        pen.line(side, &[(54, 2.2, 3.0), (54, 3.6, -1.0), (54, 3.0, -6.0)], 0.55, 0.85, |s| s.shoulder = 2.6);
-        pen.line(side, &[(54, 1.0, -8.0), (54, 2.5, -14.0), (54, 2.0, -20.0)], 0.35, 0.9, |s| s.shoulder = 3.4);
+        pen.line(side, &[(54, 2.2, 3.0), (54, 3.6, -1.0), (54, 3.0, -6.0)], 0.40, 0.85, |s| s.shoulder = 2.6);
         crows_feet(pen, side);
         // Lower lid: soft arcs below the eye.
         pen.line(side, &[(42, 3.0, -3.0), (47, 0.0, -3.6), (46, 0.0, -3.6), (45, 2.0, -3.0)], 0.30, 0.5, |s| s.shoulder = 1.8);

@@ -1,0 +1,197 @@
+//! `render` and `still` as a user runs them: the real program, a feed file, tiny pictures. Where there is no adapter they show
+//! as ignored.
+
+use libtest_mimic::{Arguments, Failed, Trial};
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+fn main() {
+    let has_adapter = has_adapter();
+    let drawn = |name: &str, test: fn() -> Result<(), Failed>| Trial::test(name, test).with_ignored_flag(!has_adapter);
+    let trials = vec![
+        drawn("every_tenth_frame_is_named_by_its_index", every_tenth_frame_is_named_by_its_index),
+        drawn("limit_ends_after_so_many_pictures", limit_ends_after_so_many_pictures),
+        drawn("views_show_different_things", views_show_different_things),
+        drawn("two_processes_draw_the_same_bytes", two_processes_draw_the_same_bytes),
+        drawn("bad_line_ends_it_and_is_named", bad_line_ends_it_and_is_named),
+        drawn("still_draws_the_pose_it_is_asked_for", still_draws_the_pose_it_is_asked_for),
+        drawn("unknown_names_are_refused_with_those_there_are", unknown_names_are_refused_with_those_there_are),
+        Trial::test("numbers_out_of_range_are_refused", numbers_out_of_range_are_refused),
+    ];
+    libtest_mimic::run(&Arguments::from_args(), trials).exit();
+}
+
+fn has_adapter() -> bool {
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle_from_env());
+    pollster::block_on(wgpu::util::initialize_adapter_from_env_or_default(&instance, None)).is_ok()
+}
+
+/// A folder of this test's own, emptied.
+fn folder(name: &str) -> PathBuf {
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("render").join(name);
+    let _ = std::fs::remove_dir_all(&path);
+    std::fs::create_dir_all(&path).expect("the build's own folder can be written");
+    path
+}
+
+/// A feed in `folder` of 21 frames whose brows rise from rest, a frame a line after the hello; `line` (from 1) replaced.
+fn feed(folder: &Path, line: Option<(usize, &str)>) -> PathBuf {
+    let mut lines = vec![r#"{"type":"hello","version":1,"source":"test","fps":25}"#.to_owned()];
+    lines.extend((0..21).map(|i| {
+        let (t, weight) = (f64::from(i) * 0.04, f64::from(i) / 20.0);
+        format!(r#"{{"type":"frame","t":{t:.2},"weights":{{"browInnerUp":{weight},"browOuterUpLeft":{weight}}}}}"#)
+    }));
+    if let Some((line, text)) = line {
+        text.clone_into(&mut lines[line - 1]);
+    }
+    let text = lines.iter().fold(String::new(), |mut text, line| {
+        // Writing to a String cannot fail.
+        let _ = writeln!(text, "{line}");
+        text
+    });
+    let path = folder.join("feed.jsonl");
+    std::fs::write(&path, text).expect("the build's own folder can be written");
+    path
+}
+
+fn client(args: &[&str]) -> std::io::Result<Output> {
+    // Where a machine has none, the software driver says so on standard error, among what the program says.
+    Command::new(env!("CARGO_BIN_EXE_rhytid-client")).args(args).env("XDG_RUNTIME_DIR", env!("CARGO_TARGET_TMPDIR")).output()
+}
+
+fn render(feed: &Path, out: &Path, more: &[&str]) -> std::io::Result<Output> {
+    let (feed, out) = (feed.display().to_string(), out.display().to_string());
+    client(&[&["render", &feed, "--out", &out, "--size", "64x64"], more].concat())
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn check(output: &Output) -> Result<(), Failed> {
+    if output.status.success() { Ok(()) } else { Err(format!("{}: {}", output.status, stderr(output)).into()) }
+}
+
+/// Names of the pictures in `folder`, sorted.
+fn pictures(folder: &Path) -> std::io::Result<Vec<String>> {
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(folder)? {
+        names.push(entry?.file_name().to_string_lossy().into_owned());
+    }
+    names.retain(|name| name.ends_with(".png"));
+    names.sort();
+    Ok(names)
+}
+
+fn every_tenth_frame_is_named_by_its_index() -> Result<(), Failed> {
+    let out = folder("every");
+    let output = render(&feed(&out, None), &out, &["--every", "10"])?;
+    check(&output)?;
+    assert_eq!(pictures(&out)?, ["00000.png", "00010.png", "00020.png"]);
+    assert_eq!(String::from_utf8_lossy(&output.stdout), format!("3 pictures in {}\n", out.display()));
+    for name in pictures(&out)? {
+        let picture = image::open(out.join(&name))?;
+        assert_eq!((picture.width(), picture.height()), (64, 64), "{name}");
+    }
+    let (first, last) = (std::fs::read(out.join("00000.png"))?, std::fs::read(out.join("00020.png"))?);
+    assert!(first != last, "the brows have risen");
+    Ok(())
+}
+
+fn limit_ends_after_so_many_pictures() -> Result<(), Failed> {
+    let out = folder("limit");
+    check(&render(&feed(&out, None), &out, &["--every", "10", "--limit", "2"])?)?;
+    assert_eq!(pictures(&out)?, ["00000.png", "00010.png"]);
+    Ok(())
+}
+
+fn views_show_different_things() -> Result<(), Failed> {
+    let out = folder("views");
+    let feed = feed(&out, None);
+    let mut seen = Vec::new();
+    for view in ["beauty", "normals", "influence:stretch"] {
+        let of_view = out.join(view.replace(':', "_"));
+        check(&render(&feed, &of_view, &["--every", "1000", "--view", view])?)?;
+        seen.push(std::fs::read(of_view.join("00000.png"))?);
+    }
+    assert!(seen[0] != seen[1] && seen[1] != seen[2] && seen[0] != seen[2]);
+    Ok(())
+}
+
+fn two_processes_draw_the_same_bytes() -> Result<(), Failed> {
+    let out = folder("same");
+    let feed = feed(&out, None);
+    for run in ["a", "b"] {
+        check(&render(&feed, &out.join(run), &["--every", "20"])?)?;
+    }
+    assert_eq!(pictures(&out.join("a"))?, ["00000.png", "00020.png"]);
+    for name in pictures(&out.join("a"))? {
+        let (a, b) = (std::fs::read(out.join("a").join(&name))?, std::fs::read(out.join("b").join(&name))?);
+        assert!(a == b, "{name} differs between two runs");
+    }
+    Ok(())
+}
+
+fn bad_line_ends_it_and_is_named() -> Result<(), Failed> {
+    let out = folder("bad");
+    // No number, and no JSON.
+    for bad in [r#"{"type":"frame","t":0.12,"weights":{"browInnerUp":"much"}}"#, r#"{"type":"frame","t":0.12,"weights":"#] {
+        let feed = feed(&out, Some((5, bad)));
+        let output = render(&feed, &out.join("pictures"), &["--every", "1000"])?;
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.starts_with("error: ") && said.contains("feed.jsonl") && said.contains("line 5"), "{said}");
+        assert_eq!(said.trim_end().lines().count(), 1, "{said}");
+    }
+    Ok(())
+}
+
+fn still_draws_the_pose_it_is_asked_for() -> Result<(), Failed> {
+    let out = folder("still");
+    let draw = |name: &str, args: &[&str]| -> Result<Vec<u8>, Failed> {
+        let path = out.join(name).display().to_string();
+        check(&client(&[&["still", "--size", "64x64", "--out", &path], args].concat())?)?;
+        Ok(std::fs::read(path)?)
+    };
+    let rest = draw("rest.png", &[])?;
+    let stretch = draw("stretch.png", &["--pose", "stretch"])?;
+    assert!(rest != stretch);
+    assert!(rest == draw("none.png", &["--pose", "stretch", "--amount", "0"])?, "nothing of a pose is the face at rest");
+    Ok(())
+}
+
+fn unknown_names_are_refused_with_those_there_are() -> Result<(), Failed> {
+    let out = folder("unknown");
+    let feed = feed(&out, None);
+    let refused = |output: Output, parts: &[&str]| {
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert_eq!(said.trim_end().lines().count(), 1, "{said}");
+        for part in parts {
+            assert!(said.contains(part), "{said:?} lacks {part:?}");
+        }
+    };
+    refused(render(&feed, &out.join("pictures"), &["--view", "sideways"])?, &["sideways", "beauty", "wireframe"]);
+    refused(render(&feed, &out.join("pictures"), &["--view", "influence:frown"])?, &["frown", "stretch"]);
+    let picture = out.join("still.png").display().to_string();
+    refused(client(&["still", "--pose", "frown", "--out", &picture])?, &["pose \"frown\"", "stretch"]);
+    assert!(!out.join("pictures").exists() && !out.join("still.png").exists(), "nothing is left behind");
+    Ok(())
+}
+
+fn numbers_out_of_range_are_refused() -> Result<(), Failed> {
+    for (args, expected) in [
+        (["--zoom", "nan"], "\"nan\" is no distance, expected 0.05 to 20"),
+        (["--zoom", "0"], "expected 0.05 to 20"),
+        (["--orbit", "nan,0"], "expected YAW,PITCH"),
+        (["--size", "0x64"], "expected WIDTHxHEIGHT"),
+        (["--every", "0"], "0 is not in 1.."),
+    ] {
+        let output = client(&[&["render", "feed.jsonl", "--out", "nowhere"], &args[..]].concat())?;
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.lines().next().is_some_and(|line| line.contains(expected)), "{said}");
+    }
+    Ok(())
+}
