@@ -63,6 +63,8 @@ pub struct CharacterAsset {
     pub morphs: Morphs,
     /// The wrinkle maps, if any pose has one.
     pub wrinkles: Option<WrinkleMaps>,
+    /// Maps of the wrinkle zones, where the character has them.
+    pub zones: Option<ZoneMaps>,
 }
 
 impl CharacterAsset {
@@ -218,6 +220,25 @@ pub enum Alpha {
     Opaque,
     /// It becomes coverage of the samples of a pixel.
     Coverage,
+}
+
+/// Maps of the wrinkle zones (Jimenez et al. 2011).
+#[derive(Debug)]
+pub struct ZoneMaps {
+    /// Two layers; zone `i` is channel `i % 4` of layer `i / 4`.
+    pub masks: [MipChain; 2],
+    /// Partial derivatives of the wrinkles of all zones, and the largest slope their codes reach.
+    pub map: MipChain,
+    /// See `map`.
+    pub scale: f32,
+    /// What takes the creases out of stretched skin; flat where the character has none.
+    pub stretch: MipChain,
+    /// See `stretch`; 0 where the character has none.
+    pub stretch_scale: f32,
+    /// The wrinkles as differences of unit normals, where the character has them.
+    pub difference: Option<MipChain>,
+    /// Metres from one wrinkle to the next.
+    pub wavelength: f32,
 }
 
 /// All wrinkle maps of a character, one layer a pose.

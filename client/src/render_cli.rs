@@ -2,8 +2,11 @@
 
 use crate::asset::{AssetError, CharacterAsset};
 use crate::picture_size::parse_size;
-use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, ViewError, ViewMode};
+use crate::renderer::{
+    BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode, WrinkleSystem, ZoneBlend,
+};
 use glam::{Quat, Vec3};
+use image::RgbaImage;
 use indicatif::{ProgressBar, ProgressStyle};
 use rhytid_server::feed::{Feed, FeedError, FeedItem};
 use rhytid_server::solve::{SolveConfig, SolveError, Solver};
@@ -53,6 +56,30 @@ pub enum PictureError {
         /// What the solve said.
         source: SolveError,
     },
+    /// A file holds no neutral face.
+    #[error("{path} holds no neutral face: {source}")]
+    Calibration {
+        /// The file.
+        path: String,
+        /// What was read instead.
+        source: serde_json::Error,
+    },
+    /// A neutral face is not one for this feed.
+    #[error("{path} is of another feed or damaged: {source}")]
+    Unfit {
+        /// The file.
+        path: String,
+        /// What the solve said.
+        source: SolveError,
+    },
+    /// There is no neutral face to write.
+    #[error("{feed} came to no neutral face, nothing to write to {path}")]
+    NoNeutral {
+        /// The feed.
+        feed: String,
+        /// The file.
+        path: String,
+    },
     /// A pose given on the command line was refused.
     #[error(transparent)]
     Solve(#[from] SolveError),
@@ -82,7 +109,7 @@ pub struct PictureArgs {
     /// Pixels, WIDTHxHEIGHT
     #[arg(long, default_value = "512x512", value_parser = parse_size)]
     pub size: [u32; 2],
-    /// beauty, bare, split, influence, influence:POSE, normals or wireframe
+    /// beauty, bare, split, influence, influence:POSE, normals, wireframe, diffuse, specular, scattering or translucency
     #[arg(long, default_value = "beauty")]
     pub view: String,
     /// How wrinkle maps become normals: pd, simple or printed
@@ -100,6 +127,21 @@ pub struct PictureArgs {
     /// Distance of the camera, 1 frames the head
     #[arg(long, default_value_t = 1.0, value_parser = parse_zoom)]
     pub zoom: f32,
+    /// Whose wrinkles: own (what the character is made for), bones, zones or both
+    #[arg(long, default_value_t = WrinkleSystem::Own)]
+    pub wrinkles: WrinkleSystem,
+    /// How zones' wrinkles are blended: pd, difference or two-maps
+    #[arg(long, default_value_t = ZoneBlend::PartialDerivatives)]
+    pub zone_blend: ZoneBlend,
+    /// Set-up of lights: portrait or sunset
+    #[arg(long, default_value_t = Studio::Portrait)]
+    pub light: Studio,
+    /// Turn of the key light in degrees: positive goes to the character's left
+    #[arg(long, default_value_t = 0.0, value_parser = parse_degrees, allow_hyphen_values = true)]
+    pub key_turn: f32,
+    /// Picture is drawn this many times as large a side and averaged, 1 to 4
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=4))]
+    pub supersample: u32,
 }
 
 /// Arguments of `render`.
@@ -117,6 +159,12 @@ pub struct RenderArgs {
     /// Stop after this many pictures
     #[arg(long)]
     pub limit: Option<usize>,
+    /// Start from the neutral face that --save-calibration wrote instead of searching for one
+    #[arg(long, value_name = "FILE.json")]
+    pub calibration: Option<PathBuf>,
+    /// Write the neutral face that the feed came to
+    #[arg(long, value_name = "FILE.json")]
+    pub save_calibration: Option<PathBuf>,
     /// Picture
     #[command(flatten)]
     pub picture: PictureArgs,
@@ -160,40 +208,55 @@ pub enum StillSide {
 }
 
 /// A character on a device, with the settings of the command line.
-struct Studio {
+struct PictureMaker {
     asset: CharacterAsset,
     headless: Headless,
     settings: DrawSettings,
     size: [u32; 2],
+    supersample: u32,
 }
 
-impl Studio {
+impl PictureMaker {
     fn open(args: &PictureArgs) -> Result<Self> {
         let asset = load_character(args.character.as_deref())?;
         let mut camera = Camera::front(&asset.character);
         camera.orbit(args.orbit[0].to_radians(), args.orbit[1].to_radians());
         camera.zoom(args.zoom);
         let view = ViewMode::parse(&args.view, &asset.character)?;
-        let settings = DrawSettings { view, deform: args.deform, blend: args.blend, ..DrawSettings::new(camera) };
+        let settings = DrawSettings {
+            view,
+            deform: args.deform,
+            blend: args.blend,
+            system: args.wrinkles,
+            zone_blend: args.zone_blend,
+            studio: args.light,
+            key_turn: args.key_turn.to_radians(),
+            ..DrawSettings::new(camera)
+        };
         let headless = Headless::new(&asset)?;
         tracing::info!(adapter = headless.adapter().name, "drawing");
-        Ok(Self { asset, headless, settings, size: args.size })
+        Ok(Self { asset, headless, settings, size: args.size, supersample: args.supersample })
     }
 
     fn draw(&mut self, frame: &FaceFrame, path: &Path) -> Result<()> {
-        let picture = self.headless.render(self.size, &self.settings, &RenderFrame::from(frame))?;
+        let large = self.size.map(|side| side * self.supersample);
+        let picture = self.headless.render(large, &self.settings, &RenderFrame::from(frame))?;
+        let picture = if self.supersample > 1 { averaged(&picture, self.supersample) } else { picture };
         picture.save(path).map_err(|source| PictureError::Write { path: path.display().to_string(), source })
     }
 }
 
 /// Solves a whole feed and draws its frames; returns how many pictures were written.
 pub fn render(args: &RenderArgs) -> Result<usize> {
-    let mut studio = Studio::open(&args.picture)?;
-    let character = Arc::clone(&studio.asset.character);
+    let mut maker = PictureMaker::open(&args.picture)?;
+    let character = Arc::clone(&maker.asset.character);
     let path = args.feed.display().to_string();
     let num_frames = count_frames(&args.feed)?;
     let mut feed = Feed::open(&args.feed, &character)?;
-    let mut solver = Solver::new(Arc::clone(&character), &SolveConfig::default(), &feed.hello)?;
+    let mut solver = match &args.calibration {
+        Some(path) => start_calibrated(&character, &feed.hello, path)?,
+        None => Solver::new(Arc::clone(&character), &SolveConfig::default(), &feed.hello)?,
+    };
     std::fs::create_dir_all(&args.out).map_err(|source| PictureError::Io { path: args.out.display().to_string(), source })?;
 
     let progress = progress_bar(num_frames);
@@ -210,7 +273,7 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
                     source,
                 })?;
                 if index.is_multiple_of(args.every as usize) {
-                    studio.draw(&solved, &args.out.join(format!("{index:05}.png")))?;
+                    maker.draw(&solved, &args.out.join(format!("{index:05}.png")))?;
                     num_written += 1;
                 }
                 index += 1;
@@ -222,13 +285,37 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
         }
     }
     progress.finish_and_clear();
+    if let Some(path) = &args.save_calibration {
+        save_calibration(&solver, &args.feed, path)?;
+    }
     Ok(num_written)
+}
+
+/// A solver that starts from the neutral face in the file at `path`.
+fn start_calibrated(character: &Arc<Character>, hello: &PublishHello, path: &Path) -> Result<Solver> {
+    let shown = path.display().to_string();
+    let text = std::fs::read(path).map_err(|source| PictureError::Io { path: shown.clone(), source })?;
+    let calibration = serde_json::from_slice(&text).map_err(|source| PictureError::Calibration { path: shown.clone(), source })?;
+    // What is wrong with the hello is no fault of the file.
+    Solver::new(Arc::clone(character), &SolveConfig::default(), hello)?;
+    Solver::with_calibration(Arc::clone(character), &SolveConfig::default(), hello, calibration)
+        .map_err(|source| PictureError::Unfit { path: shown, source })
+}
+
+/// Writes the neutral face in use to the file at `path`.
+fn save_calibration(solver: &Solver, feed: &Path, path: &Path) -> Result<()> {
+    let shown = path.display().to_string();
+    let Some(calibration) = solver.calibration() else {
+        return Err(PictureError::NoNeutral { feed: feed.display().to_string(), path: shown });
+    };
+    let text = serde_json::to_string_pretty(calibration).map_err(|source| PictureError::Calibration { path: shown.clone(), source })?;
+    std::fs::write(path, text + "\n").map_err(|source| PictureError::Io { path: shown, source })
 }
 
 /// Draws one picture of a pose, through the same solve as everything else.
 pub fn still(args: &StillArgs) -> Result<()> {
-    let mut studio = Studio::open(&args.picture)?;
-    let character = Arc::clone(&studio.asset.character);
+    let mut maker = PictureMaker::open(&args.picture)?;
+    let character = Arc::clone(&maker.asset.character);
     let head = HeadPose {
         rotation: Quat::from_rotation_y(args.head[0].to_radians()) * Quat::from_rotation_x(-args.head[1].to_radians()),
         position: Vec3::ZERO,
@@ -243,15 +330,15 @@ pub fn still(args: &StillArgs) -> Result<()> {
         TrackingData::Weights { weights: Box::new(parse_weights(&args.weights)?), head: Some(head) }
     };
     let solved = solve_one(&character, data)?;
-    studio.draw(&solved, &args.out)
+    maker.draw(&solved, &args.out)
 }
 
 /// One frame by itself, as the first of a session.
 pub fn solve_one(character: &Arc<Character>, data: TrackingData) -> std::result::Result<FaceFrame, SolveError> {
-    let hello = PublishHello { source: "still".into(), fps: None, layout: None, image: None, focal: None, takeover: false };
+    let hello = PublishHello { source: "still".into(), ..PublishHello::default() };
     let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
     let mut solved = FaceFrame::at_rest(character);
-    solver.solve(&TrackingFrame { t: 0.0, data }, &mut solved)?;
+    solver.solve(&TrackingFrame::new(0.0, data), &mut solved)?;
     Ok(solved)
 }
 
@@ -324,6 +411,32 @@ fn parse_zoom(text: &str) -> std::result::Result<f32, String> {
 fn parse_amount(text: &str) -> std::result::Result<f32, String> {
     let amount = text.trim().parse().ok().filter(|amount| (0.0..=1.0).contains(amount));
     amount.ok_or_else(|| format!("{text:?} is no amount, expected 0 to 1"))
+}
+
+fn parse_degrees(text: &str) -> std::result::Result<f32, String> {
+    text.parse().ok().filter(|value: &f32| value.is_finite()).ok_or_else(|| format!("{text:?} is no angle, expected degrees"))
+}
+
+/// Each pixel the mean of `factor` by `factor`, in linear light.
+fn averaged(picture: &RgbaImage, factor: u32) -> RgbaImage {
+    let linear: Vec<f32> = (0..256)
+        .map(|code| {
+            let encoded = code as f32 / 255.0;
+            if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+        })
+        .collect();
+    let encode = |light: f32| if light <= 0.003_130_8 { light * 12.92 } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 };
+    RgbaImage::from_fn(picture.width() / factor, picture.height() / factor, |x, y| {
+        let mut sum = [0.0; 3];
+        for i in 0..factor * factor {
+            let texel = picture.get_pixel(x * factor + i % factor, y * factor + i / factor);
+            for channel in 0..3 {
+                sum[channel] += linear[usize::from(texel[channel])];
+            }
+        }
+        let [r, g, b] = sum.map(|sum| (encode(sum / (factor * factor) as f32) * 255.0).round() as u8);
+        image::Rgba([r, g, b, 255])
+    })
 }
 
 fn parse_pair(text: &str) -> std::result::Result<[f32; 2], String> {

@@ -18,20 +18,23 @@ pub mod scattering;
 mod shadow;
 mod studio;
 mod targets;
+mod timing;
 mod tone;
 pub mod uniforms;
 mod upload;
 mod view;
+mod zones;
 
 pub use camera::Camera;
 pub use coefficients::{bone_major, moves_bone, pose_table};
 pub use deformation::{Deformation, DeformationError};
 pub use frame::RenderFrame;
-pub use headless::{AdapterChoice, Headless, RenderError, required_limits};
+pub use headless::{AdapterChoice, Headless, RenderError, optional_features, required_limits};
 pub use pipelines::VERTEX_LAYOUT;
 pub(crate) use read_back::read_back;
 pub use studio::{Studio, StudioError};
-pub use view::{BlendError, BlendMode, Term, ViewError, ViewMode};
+pub use timing::{Pass, PassTimer};
+pub use view::{BlendError, BlendMode, NameError, Term, ViewError, ViewMode, WrinkleSystem, ZoneBlend};
 
 use crate::asset::{CharacterAsset, Palette, Surface};
 use anatomy::{Mouth, eyeballs, gazes};
@@ -46,6 +49,7 @@ use std::sync::Arc;
 use targets::Targets;
 use tone::{Shown, Tone};
 use upload::{CharacterGroup, Primitive, Uploader};
+use zones::ZoneScales;
 
 /// What one drawing shows and how; changes nothing in the renderer.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -60,6 +64,10 @@ pub struct DrawSettings {
     pub blend: BlendMode,
     /// Off: every influence counts as 0, but the pipeline with the wrinkle code draws.
     pub wrinkles: bool,
+    /// Whose wrinkles are drawn.
+    pub system: WrinkleSystem,
+    /// How the zones' wrinkles are blended.
+    pub zone_blend: ZoneBlend,
     /// Multiplies the light before the tone map; 1 is the studio's own.
     pub exposure: f32,
     /// Set-up of lights.
@@ -102,6 +110,8 @@ impl DrawSettings {
             deform: Deformation::Bones,
             blend: BlendMode::PartialDerivatives,
             wrinkles: true,
+            system: WrinkleSystem::default(),
+            zone_blend: ZoneBlend::default(),
             exposure: 1.0,
             studio: Studio::default(),
             key_turn: 0.0,
@@ -121,6 +131,7 @@ pub struct Renderer {
     bounds: Bounds,
     primitives: Vec<Primitive>,
     group: CharacterGroup,
+    zone_scales: Option<ZoneScales>,
     pipelines: Pipelines,
     background: wgpu::RenderPipeline,
     shadow: Shadow,
@@ -134,14 +145,21 @@ pub struct Renderer {
     frame_group_unlit: wgpu::BindGroup,
     presenter: Presenter,
     targets: Option<Targets>,
+    /// Of the picture being drawn, pixels.
+    height: u32,
     /// Pictures so far: the grain changes with it.
     num_drawn: u32,
+    /// Draw calls of the last picture.
+    num_draws: u32,
     static_bytes: u64,
     target_format: wgpu::TextureFormat,
 }
 
-/// Of the demonstration of Jimenez and others (2010), whose translucency of 0.83 comes to 0.935 per mm.
-const FLESH_PER_MM: f32 = 0.935;
+/// Metres from one furrow of the forehead to the next: where they cover less than a few pixels, wrinkles fade.
+const FURROW_WAVELENGTH: f32 = 0.006;
+/// How fast light dies in flesh, 1/mm: a translucency of 0.92, where the 0.83 of the demonstration of Jimenez and others
+/// (2010) comes to 0.935 per mm. Tuned by eye on ears against the light.
+const FLESH_PER_MM: f32 = 0.935 * (1.0 - 0.92) / (1.0 - 0.83);
 
 /// Sphere round the neutral character, metres, model space.
 #[derive(Debug, Clone, Copy)]
@@ -184,6 +202,7 @@ impl Renderer {
             has_shapes: !asset.morphs.is_empty(),
             bounds: Bounds::new(asset),
             group,
+            zone_scales: asset.zones.as_ref().map(ZoneScales::new),
             pipelines: Pipelines::new(&layouts, asset.character.num_poses()),
             background: background::pipeline(device),
             static_bytes: uploader.bytes + shadow.bytes,
@@ -197,7 +216,9 @@ impl Renderer {
             frame_group_unlit,
             presenter: Presenter::new(device, target_format),
             targets: None,
+            height: 1,
             num_drawn: 0,
+            num_draws: 0,
             primitives,
             target_format,
         }
@@ -206,7 +227,8 @@ impl Renderer {
     /// Records the drawing of `frame` into `target`, which is `size` pixels large and is overwritten.
     ///
     /// Submit what was recorded before the next call: a frame's uniforms are written to the queue here.
-    /// A frame that does not fit the character ([`RenderFrame::fits`]) is drawn as the character at rest.
+    /// A frame that does not fit the character ([`RenderFrame::fits`]) is drawn as the character at rest. With a `timer`
+    /// each pass is stamped.
     #[allow(clippy::too_many_arguments, reason = "the four wgpu handles come with every call of this kind")]
     pub fn draw(
         &mut self,
@@ -217,22 +239,28 @@ impl Renderer {
         size: [u32; 2],
         settings: &DrawSettings,
         frame: &RenderFrame,
+        timer: Option<&PassTimer>,
     ) {
+        let stamps = |pass: Pass| timer.map(|timer| timer.writes(pass));
+        self.num_draws = 0;
         let size = size.map(|side| side.max(1));
+        self.height = size[1];
         let targets = match self.targets.take() {
             Some(targets) if targets.size == size => targets,
             _ => Targets::new(device, size, &self.scattering, &self.tone, &self.presenter),
         };
         self.write_uniforms(queue, size, settings, frame);
-        self.draw_shadow(encoder);
-        self.draw_scene(device, encoder, &targets, settings);
+        self.draw_shadow(encoder, stamps(Pass::Shadow));
+        self.draw_scene(device, encoder, &targets, settings, stamps(Pass::Scene));
         let is_scattered = settings.view.is_lit() && settings.skin.scattering > 0.0;
         if is_scattered {
-            self.scattering.draw(encoder, &targets);
+            self.scattering.draw(encoder, &targets, [stamps(Pass::ScatterAcross), stamps(Pass::ScatterUp)]);
+            self.num_draws += 2;
         }
         let tone_group = if is_scattered { &targets.tone_scattered } else { &targets.tone_plain };
-        fullscreen::draw(encoder, "tone", &self.tone.pipeline, tone_group, &targets.picture);
-        fullscreen::draw(encoder, "present", &self.presenter.pipeline, &targets.present_group, target);
+        fullscreen::draw(encoder, Pass::Tone, &self.tone.pipeline, tone_group, &targets.picture, stamps(Pass::Tone));
+        fullscreen::draw(encoder, Pass::Present, &self.presenter.pipeline, &targets.present_group, target, stamps(Pass::Present));
+        self.num_draws += 2;
         self.targets = Some(targets);
     }
 
@@ -244,6 +272,16 @@ impl Renderer {
     /// The character drawn.
     pub fn character(&self) -> &Arc<Character> {
         &self.character
+    }
+
+    /// Bytes of the zones' masks and of their wrinkle map.
+    pub fn zone_bytes(&self) -> u64 {
+        self.group.zone_bytes
+    }
+
+    /// Draw calls of the last picture.
+    pub fn num_draws(&self) -> u32 {
+        self.num_draws
     }
 
     /// Bytes of buffers and textures this renderer holds on the device.
@@ -274,8 +312,13 @@ impl Renderer {
 
         let (num_bones, num_poses) = (character.num_bones(), character.num_poses());
         let mut coefficients = bone_major(&frame.influences, num_bones, num_poses);
-        if !settings.wrinkles {
-            coefficients.fill([0.0; 4]);
+        // Wrinkles narrower than a few pixels would only glitter.
+        let fade = settings.camera.wrinkle_fade(FURROW_WAVELENGTH, size[1]) * f32::from(u8::from(settings.wrinkles));
+        coefficients.iter_mut().flatten().for_each(|coefficient| *coefficient *= fade);
+        if let Some(scales) = &self.zone_scales {
+            let fade = settings.camera.wrinkle_fade(scales.wavelength, size[1]) * f32::from(u8::from(settings.wrinkles));
+            let weights = scales.weights(frame, settings.zone_blend, fade);
+            queue.write_buffer(&self.group.zone_weights, 0, bytemuck::bytes_of(&weights));
         }
         queue.write_buffer(&self.group.coefficients, 0, bytemuck::cast_slice(&coefficients));
         queue.write_buffer(&self.frame_block, 0, bytemuck::bytes_of(&self.frame_uniforms(size, settings, frame)));
@@ -299,6 +342,21 @@ impl Renderer {
             padding: 0,
         };
         queue.write_buffer(&self.presenter.block, 0, bytemuck::bytes_of(&present));
+    }
+
+    /// Whether bones' and zones' wrinkles are drawn: those asked for that the character has and that are near enough.
+    fn systems(&self, settings: &DrawSettings) -> (bool, bool) {
+        let has_maps = self.character.poses.iter().any(|pose| pose.map.is_some());
+        let height = self.height;
+        let is_near = |wavelength: f32| settings.camera.wrinkle_fade(wavelength, height) > 0.0;
+        let zones = self.zone_scales.as_ref().filter(|scales| is_near(scales.wavelength));
+        let (bones, zones) = (has_maps && is_near(FURROW_WAVELENGTH), zones.is_some_and(|scales| scales.has(settings.zone_blend)));
+        match settings.system {
+            WrinkleSystem::Own => (bones, zones && !has_maps),
+            WrinkleSystem::Bones => (bones, false),
+            WrinkleSystem::Zones => (false, zones),
+            WrinkleSystem::Both => (bones, zones),
+        }
     }
 
     /// Fills the environment for a set-up.
@@ -356,18 +414,26 @@ impl Renderer {
         }
     }
 
-    fn draw_shadow(&self, encoder: &mut wgpu::CommandEncoder) {
-        let mut pass = self.shadow.begin(encoder);
+    fn draw_shadow(&mut self, encoder: &mut wgpu::CommandEncoder, stamps: Option<wgpu::RenderPassTimestampWrites<'_>>) {
+        let mut pass = self.shadow.begin(encoder, stamps);
         pass.set_bind_group(0, &self.frame_group_unlit, &[]);
         pass.set_bind_group(1, &self.group.group, &[]);
         for primitive in self.primitives.iter().filter(|primitive| !matches!(primitive.surface, Surface::Wet | Surface::Hair)) {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
+            self.num_draws += 1;
         }
     }
 
-    fn draw_scene(&mut self, device: &wgpu::Device, encoder: &mut wgpu::CommandEncoder, targets: &Targets, settings: &DrawSettings) {
+    fn draw_scene(
+        &mut self,
+        device: &wgpu::Device,
+        encoder: &mut wgpu::CommandEncoder,
+        targets: &Targets,
+        settings: &DrawSettings,
+        stamps: Option<wgpu::RenderPassTimestampWrites<'_>>,
+    ) {
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("scene"),
             color_attachments: &[(&targets.specular_samples, &targets.specular), (&targets.diffuse_samples, &targets.diffuse)].map(
@@ -385,36 +451,40 @@ impl Renderer {
                 depth_ops: Some(wgpu::Operations { load: wgpu::LoadOp::Clear(1.0), store: wgpu::StoreOp::Discard }),
                 stencil_ops: None,
             }),
-            timestamp_writes: None,
+            timestamp_writes: stamps,
             occlusion_query_set: None,
             multiview_mask: None,
         });
         pass.set_pipeline(&self.background);
         pass.draw(0..3, 0..1);
+        self.num_draws += 1;
         let blend = Look::blend_index(settings.blend);
         match settings.view {
-            ViewMode::Beauty | ViewMode::Term(_) => self.draw_primitives(device, &mut pass, Look::Wrinkled(blend)),
-            ViewMode::Bare => self.draw_primitives(device, &mut pass, Look::Bare),
-            ViewMode::Influence(_) => self.draw_primitives(device, &mut pass, Look::Influence),
-            ViewMode::Normals => self.draw_primitives(device, &mut pass, Look::Normals(blend)),
+            ViewMode::Beauty | ViewMode::Term(_) => self.draw_primitives(device, &mut pass, settings, Look::Wrinkled(blend)),
+            ViewMode::Bare => self.draw_primitives(device, &mut pass, settings, Look::Bare),
+            ViewMode::Influence(_) => self.draw_primitives(device, &mut pass, settings, Look::Influence),
+            ViewMode::Normals => self.draw_primitives(device, &mut pass, settings, Look::Normals(blend)),
             ViewMode::Wireframe => self.draw_wireframe(device, &mut pass),
             ViewMode::Split => {
                 let [width, height] = targets.size;
                 let middle = width / 2;
                 if middle > 0 {
                     pass.set_scissor_rect(0, 0, middle, height);
-                    self.draw_primitives(device, &mut pass, Look::Wrinkled(blend));
+                    self.draw_primitives(device, &mut pass, settings, Look::Wrinkled(blend));
                 }
                 pass.set_scissor_rect(middle, 0, width - middle, height);
-                self.draw_primitives(device, &mut pass, Look::Bare);
+                self.draw_primitives(device, &mut pass, settings, Look::Bare);
             }
         }
     }
 
-    fn draw_primitives(&mut self, device: &wgpu::Device, pass: &mut wgpu::RenderPass<'_>, look: Look) {
+    fn draw_primitives(&mut self, device: &wgpu::Device, pass: &mut wgpu::RenderPass<'_>, settings: &DrawSettings, look: Look) {
         pass.set_bind_group(0, &self.frame_group, &[]);
         pass.set_bind_group(1, &self.group.group, &[]);
         let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
+        let (has_bones, has_zones) = self.systems(settings);
+        let has_stretch = self.zone_scales.as_ref().is_some_and(ZoneScales::has_stretch);
+        let zones = (if has_zones { settings.zone_blend.number() } else { 0 }, has_stretch);
         // What adds to or covers the rest comes last.
         let rank = |surface: Surface| match surface {
             Surface::Hair => 1,
@@ -430,9 +500,11 @@ impl Renderer {
                 pass.set_vertex_buffer(0, primitive.vertices.slice(..));
                 pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
                 for region in &primitive.regions {
-                    let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha, region.poses);
+                    let poses = if has_bones { region.poses } else { 0 };
+                    let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha, poses, zones);
                     pass.set_pipeline(self.pipelines.surface(device, key));
                     pass.draw_indexed(region.indices.clone(), 0, 0..1);
+                    self.num_draws += 1;
                 }
             }
         }
@@ -452,6 +524,7 @@ impl Renderer {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.edges.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..primitive.num_edge_indices, 0, 0..1);
+            self.num_draws += 2;
         }
     }
 }

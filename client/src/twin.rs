@@ -2,6 +2,8 @@
 //! blend, the tone curve. The tests hold these to published and derived numbers, and the GPU to these.
 
 mod morph;
+pub mod skin;
+pub mod zones;
 
 pub use morph::{Morphed, morph};
 
@@ -102,7 +104,7 @@ pub fn world_from_tangent(normal: Vec3, tangent: Vec4, of_map: Vec3) -> Vec3 {
     (tangent.truncate() * of_map.x + bitangent * of_map.y + normal * of_map.z).normalize()
 }
 
-/// Twin of the tone curve in `present.wgsl` (Hable 2010): linear light to linear display values.
+/// Twin of the tone curve in `tone.wgsl` (Hable 2010): linear light to linear display values.
 pub fn filmic(light: f32, exposure: f32) -> f32 {
     let curve = |x: f32| (x * (0.15 * x + 0.05) + 0.004) / (x * (0.15 * x + 0.50) + 0.06) - 0.02 / 0.30;
     (curve(2.0 * exposure * light) / curve(11.2)).clamp(0.0, 1.0)

@@ -1,6 +1,7 @@
 //! `view`: a window that shows a room's face live.
 
 mod look;
+mod pages;
 mod painter;
 mod panel;
 mod rates;
@@ -254,6 +255,7 @@ impl App {
             link,
             playout: self.spectator.playout_stats(),
             rates: &self.rates,
+            zone_bytes: gpu.zone_bytes(),
             adapter: &adapter,
             face: gpu.face_id(),
         };

@@ -90,13 +90,13 @@ fn others(criterion: &mut Criterion) {
     criterion.bench_function("whole frame of 478 points", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
 
     let bones = character.bones.iter().enumerate().map(|(i, bone)| (i, bone.rest + Vec3::splat(0.002))).collect();
-    let frame = TrackingFrame { t: 0.0, data: TrackingData::Bones { points: bones, head: None } };
+    let frame = TrackingFrame::new(0.0, TrackingData::Bones { points: bones, head: None });
     let mut frames = Endless { frames: vec![frame], next: 0, t: 0.0 };
     let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello_of(None)).expect("a good session");
     // Easing, the skeleton and the evaluation: what every frame pays whatever it comes as.
     criterion.bench_function("whole frame of bones", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
 
-    let mut frames = Endless { frames: vec![TrackingFrame { t: 0.0, data: TrackingData::NoFace }], next: 0, t: 1e6 };
+    let mut frames = Endless { frames: vec![TrackingFrame::new(0.0, TrackingData::NoFace)], next: 0, t: 1e6 };
     criterion.bench_function("whole frame without a face", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
 }
 

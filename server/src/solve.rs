@@ -3,7 +3,7 @@
 //!
 //! One direction: landmarks → head pose removed → smoothed → regression (or expression weights → linear deltas and
 //! correctives, or an animator's own bones) → each bone's motion → eased over lost faces and new neutrals → evaluated
-//! points, rotations and influences.
+//! points, rotations and influences → wrinkle zones (expressions given or read from weights, else the influences).
 
 #![deny(clippy::disallowed_methods)]
 
@@ -14,6 +14,7 @@ mod easing;
 mod error;
 mod estimate;
 mod evaluate;
+mod expressions;
 mod filter;
 mod gaze;
 mod head_pose;
@@ -29,6 +30,7 @@ mod rotation;
 mod skeleton;
 mod weight_session;
 mod weights_to_bones;
+mod zones;
 
 /// The stages by themselves: for benchmarks, and for whoever builds another pipeline of them.
 pub mod stages {
@@ -46,12 +48,16 @@ pub use error::SolveError;
 use easing::{Easing, FaceState};
 use evaluate::Evaluator;
 use landmark_session::LandmarkSession;
-use rhytid_shared::limits::MAX_SECONDS;
+use rhytid_shared::limits::{MAX_EXPRESSIONS, MAX_SECONDS};
 use rhytid_shared::{Character, FaceFrame, HeadPose, PublishHello, TrackingData, TrackingFrame};
 use serde::Serialize;
 use skeleton::Skeleton;
 use std::sync::Arc;
 use weight_session::{SentHead, WeightSession};
+use zones::ZoneRig;
+
+/// Largest amount of an expression: as of a weight, some overshoot on strong faces.
+const LARGEST_AMOUNT: f32 = 1.2;
 
 /// Frames nearer to each other than a packet's clock can tell, seconds, are one.
 const SHORTEST_STEP: f64 = 1e-6;
@@ -91,6 +97,7 @@ pub struct Solver {
     sent_head: SentHead,
     skeleton: Skeleton,
     evaluator: Evaluator,
+    zones: Option<ZoneRig>,
     easing: Easing,
     /// The face as this frame alone would have it.
     target: FaceState,
@@ -128,6 +135,7 @@ impl Solver {
             sent_head: SentHead::new(config.mirror),
             skeleton: Skeleton::new(&character),
             evaluator: Evaluator::new(&character),
+            zones: ZoneRig::new(&character),
             easing: Easing::new(&config.lost, character.num_bones()),
             target: FaceState::at_rest(character.num_bones()),
             last_t: None,
@@ -207,7 +215,7 @@ impl Solver {
         if let Some(previous) = self.last_t.filter(|previous| t - previous < SHORTEST_STEP) {
             return Err(SolveError::Time { got: t, previous });
         }
-        let source = self.aim(t, &frame.data)?;
+        let source = self.aim(frame)?;
         self.last_t = Some(t);
         out.face = source.is_some();
         match source {
@@ -240,7 +248,27 @@ impl Solver {
     }
 
     /// Computes the target of one frame; nothing where there is no face.
-    fn aim(&mut self, t: f64, data: &TrackingData) -> Result<Option<Source>, SolveError> {
+    fn aim(&mut self, frame: &TrackingFrame) -> Result<Option<Source>, SolveError> {
+        for (index, &got) in frame.expressions.iter().flatten().enumerate() {
+            if !(0.0..=LARGEST_AMOUNT).contains(&got) {
+                return Err(SolveError::Value { field: "expressions", index, got, expected: "0 to 1.2" });
+            }
+        }
+        let source = self.aim_bones(frame.t, &frame.data)?;
+        // What the publisher says of expressions counts before what weights say. Weights that are estimated lack what landmarks
+        // hardly show: the bones' influences, which the same landmarks drive, say more.
+        let known = match (&frame.expressions, &self.target.weights, &self.zones) {
+            (Some(amounts), _, _) => Some(ZoneRig::given(amounts)),
+            (None, Some(weights), Some(zones)) if source == Some(Source::Weights) => zones.read(weights),
+            _ => None,
+        };
+        self.target.bridge = if known.is_none() { 1.0 } else { 0.0 };
+        self.target.expressions = known.unwrap_or([[0.0; 2]; MAX_EXPRESSIONS]);
+        Ok(source)
+    }
+
+    /// Computes the bones of one frame; nothing where there is no face.
+    fn aim_bones(&mut self, t: f64, data: &TrackingData) -> Result<Option<Source>, SolveError> {
         match data {
             TrackingData::NoFace => Ok(None),
             TrackingData::Landmarks { points, confidence } => {
@@ -280,7 +308,11 @@ impl Solver {
         out.influences.resize(self.character.num_poses() * num_bones, 0.0);
         self.skeleton.pose(shown, &mut out.points, &mut out.rotations);
         self.evaluator.evaluate(&out.points, &mut out.influences);
-        out.zones.clear();
+        out.zones.resize(self.character.num_zones(), 0.0);
+        out.stretched.resize(self.character.num_zones(), 0.0);
+        if let Some(zones) = &self.zones {
+            zones.write(&shown.expressions, shown.bridge, &out.influences, &mut out.zones, &mut out.stretched);
+        }
         out.shapes = shown.weights;
         let [x, y, z, right, up, front] = shown.head;
         out.head = HeadPose {

@@ -298,7 +298,7 @@ fn a_lost_face_is_held_eased_and_comes_back_without_a_jump() {
     let character = character();
     let mut solver = solver(&character, None);
     let mut out = FaceFrame::at_rest(&character);
-    solver.solve(&TrackingFrame { t: 0.0, data: TrackingData::NoFace }, &mut out).expect("a good frame");
+    solver.solve(&TrackingFrame::new(0.0, TrackingData::NoFace), &mut out).expect("a good frame");
     assert!(!out.face && largest(&out.influences) == 0.0, "no face yet");
     let raised = expression([0.010, 0.010], 0.0, 0.0, 0.0);
     let mut t = hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 0.1, 2.5);
@@ -308,7 +308,7 @@ fn a_lost_face_is_held_eased_and_comes_back_without_a_jump() {
     let lost_at = t;
     let mut before = shown;
     for _ in 0..30 {
-        solver.solve(&TrackingFrame { t, data: TrackingData::NoFace }, &mut out).expect("a good frame");
+        solver.solve(&TrackingFrame::new(t, TrackingData::NoFace), &mut out).expect("a good frame");
         let now = influence(&character, &out, "stretch", "brow_mid_r");
         let since = t - lost_at;
         assert!(!out.face);
@@ -377,7 +377,7 @@ fn a_neutral_asked_for_while_the_face_is_away_is_taken_from_several_frames() {
     let t = hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 0.0, 3.0);
     assert!(solver.take_calibrated().is_some());
     for frame in 0..30 {
-        solver.solve(&TrackingFrame { t: t + f64::from(frame) / 30.0, data: TrackingData::NoFace }, &mut out).expect("a good frame");
+        solver.solve(&TrackingFrame::new(t + f64::from(frame) / 30.0, TrackingData::NoFace), &mut out).expect("a good frame");
     }
     solver.calibrate();
     assert!(solver.take_calibrated().is_none());
@@ -413,7 +413,7 @@ fn another_source_is_blended_in() {
     let jaw = character.bone_index("jaw").expect("a jaw");
     let placed = |t: f64| {
         let at = character.bones[jaw].rest + Vec3::new(0.0, -0.018, -0.012);
-        TrackingFrame { t, data: TrackingData::Bones { points: vec![(jaw, at)], head: None } }
+        TrackingFrame::new(t, TrackingData::Bones { points: vec![(jaw, at)], head: None })
     };
     let smile = see(&expression([0.0; 2], 0.0, 0.008, 0.0), character.head_pivot, &View { yaw: 10.0, ..View::FRONT });
     let frame_of = |source: usize, t: f64| match source {
@@ -431,7 +431,7 @@ fn another_source_is_blended_in() {
             let mut run = |source: Option<usize>, frames: usize, is_watched: bool| {
                 for _ in 0..frames {
                     let before = out.clone();
-                    let frame = source.map_or(TrackingFrame { t, data: TrackingData::NoFace }, |source| frame_of(source, t));
+                    let frame = source.map_or(TrackingFrame::new(t, TrackingData::NoFace), |source| frame_of(source, t));
                     solver.solve(&frame, &mut out).expect("a good frame");
                     t += 1.0 / 30.0;
                     if is_watched {
@@ -475,7 +475,7 @@ fn a_long_absence_does_not_use_up_the_looks_at_the_neutral() {
     let mut out = FaceFrame::at_rest(&character);
     let smile = expression([0.0; 2], 0.004, 0.008, 0.0);
     let t = hold(&mut solver, &mut out, &character, &smile, &View::FRONT, 0.0, 3.0);
-    solver.solve(&TrackingFrame { t, data: TrackingData::NoFace }, &mut out).expect("a good frame");
+    solver.solve(&TrackingFrame::new(t, TrackingData::NoFace), &mut out).expect("a good frame");
     hold(&mut solver, &mut out, &character, &landmarks(), &View::FRONT, 200.0, 20.0);
     assert!(largest(&out.influences) < 0.05, "the calm face is at rest: {:?}", out.influences);
 }
@@ -790,20 +790,20 @@ fn bones_given_directly_are_evaluated_as_they_are() {
     let open = character.bones[jaw].rest + Vec3::new(0.0, -0.02, -0.01);
     let head = HeadPose { rotation: Quat::from_xyzw(0.0, 0.0, 0.6, 0.8), position: Vec3::new(0.1, 0.0, -2.0) };
     let data = TrackingData::Bones { points: vec![(brow, placed), (jaw, open)], head: Some(head) };
-    solver.solve(&TrackingFrame { t: 1.0, data }, &mut out).expect("a good frame");
+    solver.solve(&TrackingFrame::new(1.0, data), &mut out).expect("a good frame");
     assert_eq!((out.points[brow], out.points[jaw]), (placed, open));
     assert!((influence(&character, &out, "stretch", "brow_inner_r") - 0.5).abs() < 1e-5);
     assert!(out.rotations[jaw].x > 0.05 && out.rotations[brow] == Quat::IDENTITY);
     assert!(out.head.rotation.angle_between(head.rotation) < 1e-5);
     assert_eq!(out.head.position, Vec3::new(0.1, 0.0, -0.3), "bounded on the way out");
 
-    let error = solver.solve(&TrackingFrame { t: 2.0, data: TrackingData::Bones { points: vec![(99, Vec3::ZERO)], head: None } }, &mut out);
+    let error = solver.solve(&TrackingFrame::new(2.0, TrackingData::Bones { points: vec![(99, Vec3::ZERO)], head: None }), &mut out);
     assert_eq!(error, Err(SolveError::BoneIndex { got: 99, num_bones: character.num_bones() }));
     // Asked for, the head as it is now becomes the neutral one.
     solver.calibrate();
     let data = TrackingData::Bones { points: Vec::new(), head: Some(head) };
-    solver.solve(&TrackingFrame { t: 3.0, data: data.clone() }, &mut out).expect("a good frame");
-    solver.solve(&TrackingFrame { t: 4.0, data }, &mut out).expect("a good frame");
+    solver.solve(&TrackingFrame::new(3.0, data.clone()), &mut out).expect("a good frame");
+    solver.solve(&TrackingFrame::new(4.0, data), &mut out).expect("a good frame");
     assert!(out.head.rotation.angle_between(Quat::IDENTITY) < 1e-5 && out.head.position.length() < 1e-5);
 }
 
@@ -839,12 +839,12 @@ fn bad_frames_are_refused_and_count_for_nothing() {
         "landmarks do not span a face: they lie in one place, expected a face of at least a few pixels",
     );
     let data = TrackingData::Landmarks { points: good.clone(), confidence: vec![0.5; 3] };
-    refuse(TrackingFrame { t: 2.0, data }, "confidence has 3 entries, expected 68 or none");
+    refuse(TrackingFrame::new(2.0, data), "confidence has 3 entries, expected 68 or none");
     let data = TrackingData::Landmarks { points: good.clone(), confidence: vec![1.5; 68] };
-    refuse(TrackingFrame { t: 2.0, data }, "confidence[0] is 1.5, expected finite and 0 to 1");
+    refuse(TrackingFrame::new(2.0, data), "confidence[0] is 1.5, expected finite and 0 to 1");
     let head = HeadPose { rotation: Quat::from_xyzw(0.0, 0.0, 0.0, 0.0), position: Vec3::ZERO };
     refuse(
-        TrackingFrame { t: 2.0, data: TrackingData::Bones { points: Vec::new(), head: Some(head) } },
+        TrackingFrame::new(2.0, TrackingData::Bones { points: Vec::new(), head: Some(head) }),
         "head.rotation[0] is 0, expected finite and of length 1",
     );
     let mut weightless = Solver::new(character.clone(), &SolveConfig::default(), &hello(None, None)).expect("a good session");
@@ -896,7 +896,7 @@ fn a_landmark_the_tracker_does_not_believe_stays_where_it_was() {
     let confidence = (0..68).map(|i| if (17..=21).contains(&i) { 0.1 } else { 0.9 }).collect();
     let data = TrackingData::Landmarks { points: raised, confidence };
     for i in 0..20 {
-        solver.solve(&TrackingFrame { t: t + f64::from(i) / 30.0, data: data.clone() }, &mut out).expect("a good frame");
+        solver.solve(&TrackingFrame::new(t + f64::from(i) / 30.0, data.clone()), &mut out).expect("a good frame");
     }
     assert!(influence(&character, &out, "stretch", "brow_mid_r") < 0.05);
     assert!(influence(&character, &out, "stretch", "brow_mid_l") > 0.8);
@@ -914,7 +914,7 @@ fn a_landmark_never_believed_stays_where_the_restored_neutral_has_it() {
     let mut confidence = vec![1.0; 68];
     confidence[17..=26].fill(0.1);
     let points = see(&landmarks(), character.head_pivot, &View::FRONT);
-    solver.solve(&TrackingFrame { t: 0.0, data: TrackingData::Landmarks { points, confidence } }, &mut out).expect("a good frame");
+    solver.solve(&TrackingFrame::new(0.0, TrackingData::Landmarks { points, confidence }), &mut out).expect("a good frame");
     assert!(largest(&out.influences) < 0.02, "{:?}", out.influences);
 }
 
@@ -931,7 +931,7 @@ fn landmarks_never_believed_are_no_part_of_a_first_neutral() {
     confidence[17..=21].fill(0.1);
     for i in 0..100 {
         let data = TrackingData::Landmarks { points: points.clone(), confidence: confidence.clone() };
-        solver.solve(&TrackingFrame { t: f64::from(i) / 30.0, data }, &mut out).expect("a good frame");
+        solver.solve(&TrackingFrame::new(f64::from(i) / 30.0, data), &mut out).expect("a good frame");
         assert!(largest(&out.influences) < 0.05, "frame {i}");
     }
     let brow = solver.calibration().expect("reached").points[19];
@@ -953,7 +953,7 @@ fn a_bridge_alone_does_not_place_the_head() {
             .map(|p| [p[0] + if i % 2 == 0 { 0.3 } else { -0.3 }, p[1], 0.0])
             .collect();
         let data = TrackingData::Landmarks { points, confidence: confidence.clone() };
-        solver.solve(&TrackingFrame { t: t + f64::from(i) / 30.0, data }, &mut out).expect("a good frame");
+        solver.solve(&TrackingFrame::new(t + f64::from(i) / 30.0, data), &mut out).expect("a good frame");
     }
     let yaw = out.head.rotation.to_scaled_axis().y.to_degrees();
     assert!((yaw - 12.0).abs() < 3.0, "{yaw}");
@@ -975,7 +975,7 @@ fn landmarks_not_believed_are_no_part_of_the_neutral() {
     solver.solve(&landmark_frame(0.0, points), &mut out).expect("a good frame");
     for i in 1..100 {
         let data = TrackingData::Landmarks { points: stray.clone(), confidence: confidence.clone() };
-        solver.solve(&TrackingFrame { t: f64::from(i) / 30.0, data }, &mut out).expect("a good frame");
+        solver.solve(&TrackingFrame::new(f64::from(i) / 30.0, data), &mut out).expect("a good frame");
     }
     let brow = solver.calibration().expect("reached").points[19];
     assert!((brow[1] - f64::from(landmarks()[19].y)).abs() < 0.002, "{brow:?}");
@@ -1062,8 +1062,8 @@ mod any_input {
                 if i == asks {
                     solver.calibrate();
                 }
-                if solver.solve(&TrackingFrame { t, data }, &mut out).is_ok() {
-                    let falling = TrackingFrame { t: t - steps[i] * 0.5, data: TrackingData::NoFace };
+                if solver.solve(&TrackingFrame::new(t, data), &mut out).is_ok() {
+                    let falling = TrackingFrame::new(t - steps[i] * 0.5, TrackingData::NoFace);
                     prop_assert!(matches!(solver.solve(&falling, &mut out), Err(SolveError::Time { .. })), "time does not fall");
                 }
                 for (point, bone) in out.points.iter().zip(&character.bones) {
@@ -1108,7 +1108,7 @@ mod any_input {
             let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(None, None)).expect("a good session");
             let (mut out, rest) = (FaceFrame::at_rest(&character), FaceFrame::at_rest(&character));
             let weights = Box::new(std::array::from_fn(|i| before[i]));
-            solver.solve(&TrackingFrame { t: 0.0, data: TrackingData::Weights { weights, head: None } }, &mut out).expect("a good frame");
+            solver.solve(&TrackingFrame::new(0.0, TrackingData::Weights { weights, head: None }), &mut out).expect("a good frame");
             solver.solve(&weight_frame(1.0, &[]), &mut out).expect("a good frame");
             prop_assert_eq!((&out.points, &out.rotations, &out.influences), (&rest.points, &rest.rotations, &rest.influences));
         }

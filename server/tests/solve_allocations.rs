@@ -5,8 +5,9 @@ mod solve_fixture;
 use rhytid_server::pipeline::Pipeline;
 use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::layout::{IBUG_FROM_MEDIAPIPE, Layout};
+use rhytid_shared::limits::MAX_EXPRESSIONS;
 use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame, HeadPose, TrackingData, TrackingFrame};
-use solve_fixture::{character, feed, hello, landmark_frame, weight_frame};
+use solve_fixture::{character_with_zones, feed, hello, landmark_frame, weight_frame};
 use std::alloc::{GlobalAlloc, Layout as MemoryLayout, System};
 use std::cell::Cell;
 
@@ -41,7 +42,7 @@ static ALLOCATOR: Counting = Counting;
 
 #[test]
 fn frames_allocate_nothing() {
-    let character = character();
+    let character = character_with_zones();
     let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(Some(Layout::Ibug68), None)).expect("a good session");
     let mut out = FaceFrame::at_rest(&character);
     // Only a new neutral may: it is trained on, five times in the first minute and a half.
@@ -63,6 +64,17 @@ fn frames_allocate_nothing() {
         solver.solve(frame, &mut out).expect("a good frame");
     }
     assert_eq!(NUM_ALLOCATIONS.get(), before);
+    // Weights drove the zones; expressions do in their stead.
+    let mut frames = weights.clone();
+    for (i, frame) in frames.iter_mut().enumerate() {
+        (frame.t, frame.expressions) = (1.0 + i as f64 * 0.02, Some([0.5; MAX_EXPRESSIONS]));
+    }
+    let before = NUM_ALLOCATIONS.get();
+    for frame in &frames {
+        solver.solve(frame, &mut out).expect("a good frame");
+    }
+    assert_eq!(NUM_ALLOCATIONS.get(), before);
+    assert!(out.zones[0] > 0.5);
 }
 
 /// The fixture has no shapes that landmarks tell; the built-in character has.
@@ -87,7 +99,7 @@ fn expression_weights_allocate_nothing() {
 
 /// Frames that allocate after the first `num_first`, through the solve and the encoder.
 fn num_allocating(layout: Option<Layout>, frames: &[TrackingFrame], num_first: usize) -> usize {
-    let mut pipeline = Pipeline::new(character(), &SolveConfig::default(), &hello(layout, None), 1).expect("a good session");
+    let mut pipeline = Pipeline::new(character_with_zones(), &SolveConfig::default(), &hello(layout, None), 1).expect("a good session");
     // The largest packet there is fits.
     let mut packet = Vec::with_capacity(4096);
     let mut num_allocating = 0;
@@ -101,7 +113,7 @@ fn num_allocating(layout: Option<Layout>, frames: &[TrackingFrame], num_first: u
 
 #[test]
 fn packets_allocate_nothing_whatever_they_are_of() {
-    let character = character();
+    let character = character_with_zones();
     // From the third second on the first neutral is there; the next look is at five.
     let landmarks = &feed(&character, 145)[..];
     assert_eq!(num_allocating(Some(Layout::Ibug68), landmarks, 70), 0, "68 points");
@@ -125,7 +137,7 @@ fn packets_allocate_nothing_whatever_they_are_of() {
     let lost: Vec<TrackingFrame> = landmarks
         .iter()
         .enumerate()
-        .map(|(i, frame)| if (80..120).contains(&i) { TrackingFrame { t: frame.t, data: TrackingData::NoFace } } else { frame.clone() })
+        .map(|(i, frame)| if (80..120).contains(&i) { TrackingFrame::new(frame.t, TrackingData::NoFace) } else { frame.clone() })
         .collect();
     assert_eq!(num_allocating(Some(Layout::Ibug68), &lost, 70), 0, "a face lost and found");
 
@@ -133,7 +145,7 @@ fn packets_allocate_nothing_whatever_they_are_of() {
         .map(|i| {
             let points = vec![(0, character.bones[0].rest + glam::Vec3::Y * 1e-4 * i as f32), (23, character.bones[23].rest)];
             let head = Some(HeadPose { rotation: glam::Quat::IDENTITY, position: glam::Vec3::X * 1e-3 * i as f32 });
-            TrackingFrame { t: f64::from(i) / 60.0, data: TrackingData::Bones { points, head } }
+            TrackingFrame::new(f64::from(i) / 60.0, TrackingData::Bones { points, head })
         })
         .collect();
     assert_eq!(num_allocating(None, &bones, 1), 0, "bones");

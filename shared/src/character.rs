@@ -6,7 +6,9 @@
 mod checked;
 mod glb;
 pub mod schema;
+mod zones;
 
 pub use checked::{
     Bone, Character, CharacterError, Corrective, Drive, GroupDegenerate, LandmarkWeight, LidKind, Mode, Pose, ShapeDeltas, Side, WrinkleMap,
 };
+pub use zones::{BridgeRow, Expression, Zone, ZoneMap, Zones};

@@ -38,8 +38,11 @@ pub struct FaceFrame {
     pub rotations: Vec<Quat>,
     /// `o * n` influences in `[0, 1]`, pose-major: `influences[k * n + i]`.
     pub influences: Vec<f32>,
-    /// Zone weights in `[0, 1]`; empty for a character without zones.
+    /// Zone weights in `[0, 1]`: how strongly the wrinkles of each zone show; empty for a character without zones.
     pub zones: Vec<f32>,
+    /// As many again: how far each zone is stretched, in `[0, 1]`. What a zone's sum is below 0, where the character has a map
+    /// for that; at most one of a zone's two values is not 0.
+    pub stretched: Vec<f32>,
     /// Expression weights in `[0, 1]` where the feed carries them, in the order of [`crate::ARKIT_NAMES`].
     pub shapes: Option<[f32; NUM_ARKIT_SHAPES]>,
     /// Head pose.
@@ -57,7 +60,8 @@ impl FaceFrame {
             points: character.bones.iter().map(|bone| bone.rest).collect(),
             rotations: vec![Quat::IDENTITY; character.num_bones()],
             influences: vec![0.0; character.num_poses() * character.num_bones()],
-            zones: Vec::new(),
+            zones: vec![0.0; character.num_zones()],
+            stretched: vec![0.0; character.num_zones()],
             shapes: None,
             head: HeadPose::default(),
         }

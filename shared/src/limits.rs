@@ -8,6 +8,13 @@ pub const MAX_JOINTS: usize = 128;
 pub const MAX_POSES: usize = 8;
 /// Most wrinkle zones: two RGBA masks.
 pub const MAX_ZONES: usize = 8;
+/// Most expressions in a character's table: the six of the paper and as many again, and some.
+pub const MAX_EXPRESSIONS: usize = 16;
+/// Largest side of a zone mask, texels: masks are smooth (the paper's have 64), and they are decoded where a character is
+/// checked.
+pub const MAX_MASK_SIDE: u32 = 256;
+/// Largest side of the zones' wrinkle maps, texels; the paper's have 256.
+pub const MAX_ZONE_MAP_SIDE: u32 = 1024;
 /// Most feature points in a user's own layout; more than any tracker in use gives (MediaPipe: 478).
 pub const MAX_FEATURE_POINTS: usize = 512;
 /// Most vertices of a character: WebGL2 draws of this size still hold 60 Hz on a phone.
@@ -31,6 +38,8 @@ pub const MAX_MESSAGE_BYTES: usize = 256 << 10;
 /// Largest time on a sender's clock, seconds: the Unix clock stays below it for two centuries, and microseconds of it
 /// are whole numbers in an `f64`.
 pub const MAX_SECONDS: f64 = 9e9;
+/// Focal lengths from the widest lens to the longest, in widths of the picture: 157 degrees to 1 degree across.
+pub const FOCAL_RANGE: [f32; 2] = [0.1, 50.0];
 /// How far an evaluated point may travel from rest, metres: the range of a packet's 12-bit positions (25 µm a step).
 pub const MAX_BONE_TRAVEL: f32 = 0.0511875;
 /// How far the head may travel from its neutral place, metres.

@@ -35,7 +35,7 @@ use range_coder::{Reader, Writer};
 ///           3 numbers, the components left (12 bits mid-tread over ±1/√2)
 ///         1 number a coefficient slot, 0 to 255, pose by pose: groups in their order, then bones in theirs,
 ///           each only where the pose moves the bone or a member; less the projection of the bones just read
-///         1 number a wrinkle zone, 0 to 255
+///         1 number a wrinkle zone, 0 to 255; below 0, to -255, how far it is stretched
 ///         52 numbers of expression weights, 0 to 255, in ARKit's order, only with flag 4
 ///         the head: 1 rotation, 3 numbers of position, 16 bits over ±0.3 m
 /// ```

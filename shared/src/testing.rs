@@ -1,6 +1,6 @@
 //! A character small enough to reason about, for this crate's tests.
 
-use crate::character::{Bone, Character, Drive, GroupDegenerate, Mode, Pose};
+use crate::character::{Bone, Character, Drive, Expression, GroupDegenerate, Mode, Pose, Zone, ZoneMap, Zones};
 use crate::layout::NUM_IBUG;
 use glam::Vec3;
 use std::collections::BTreeMap;
@@ -48,8 +48,23 @@ pub(crate) fn tiny_character() -> Character {
         poses,
         shapes: Vec::new(),
         correctives: Vec::new(),
+        zones: None,
         mode: Mode::Independent,
         group_degenerate: GroupDegenerate::Exclude,
         falloff: 1.0,
+    }
+}
+
+/// One zone on which every expression weighs 1.
+pub(crate) fn one_zone(expressions: &[&str]) -> Zones {
+    Zones {
+        list: vec![Zone { name: "forehead".into(), side: None }],
+        masks: vec![0],
+        map: ZoneMap { texture: 0, scale: 1.0 },
+        stretch: None,
+        difference: None,
+        wavelength: 0.006,
+        expressions: expressions.iter().map(|name| Expression { name: (*name).into(), weights: vec![1.0] }).collect(),
+        bridge: Vec::new(),
     }
 }

@@ -5,13 +5,14 @@ mod reader;
 
 use crate::face::HeadPose;
 use crate::layout::Layout;
+use crate::limits::MAX_EXPRESSIONS;
 use crate::names::NUM_ARKIT_SHAPES;
 use glam::Vec3;
 
 pub use reader::PublishReader;
 
-/// A publisher's first message, checked.
-#[derive(Debug, Clone, PartialEq)]
+/// A publisher's first message, checked. By default one of an unnamed sender of weights or bones.
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct PublishHello {
     /// What the sender calls itself; at most 128 characters.
     pub source: String,
@@ -21,10 +22,21 @@ pub struct PublishHello {
     pub layout: Option<Layout>,
     /// Width and height of the tracker's picture, pixels; required with a layout.
     pub image: Option<[f32; 2]>,
-    /// Focal length of the tracker's camera, pixels; the image width serves where it is unknown.
+    /// Focal length of the tracker's camera, pixels; the image width serves where it is unknown. With an image within
+    /// [`FOCAL_RANGE`](crate::limits::FOCAL_RANGE) of its width.
     pub focal: Option<f32>,
     /// Take the room over from another publisher.
     pub takeover: bool,
+    /// Start from the neutral face that the room keeps of the same tracker, see [`Self::is_of_same_tracker`].
+    pub keep_neutral: bool,
+}
+
+impl PublishHello {
+    /// True where the two come from one tracker before one camera as far as they say, so that the neutral face of one
+    /// session is that of the other.
+    pub fn is_of_same_tracker(&self, other: &Self) -> bool {
+        (&self.source, &self.layout, self.image, self.focal) == (&other.source, &other.layout, other.image, other.focal)
+    }
 }
 
 /// One checked frame from a tracker. The buffers are reused from frame to frame.
@@ -34,6 +46,9 @@ pub struct TrackingFrame {
     pub t: f64,
     /// What the tracker saw.
     pub data: TrackingData,
+    /// Amounts of the character's expressions in `[0, 1.2]` where the sender gives them, in the order of its table; those not
+    /// named and those past the table's end are 0. They drive wrinkle zones and move no bone.
+    pub expressions: Option<[f32; MAX_EXPRESSIONS]>,
 }
 
 /// What a tracker saw in one frame.
@@ -64,9 +79,16 @@ pub enum TrackingData {
     NoFace,
 }
 
+impl TrackingFrame {
+    /// A frame whose sender gives no expressions.
+    pub fn new(t: f64, data: TrackingData) -> Self {
+        Self { t, data, expressions: None }
+    }
+}
+
 impl Default for TrackingFrame {
     fn default() -> Self {
-        Self { t: 0.0, data: TrackingData::NoFace }
+        Self::new(0.0, TrackingData::NoFace)
     }
 }
 

@@ -106,6 +106,9 @@ pub struct JsonFrame {
     pub influence: Vec<Vec<f32>>,
     /// Zone weights in `[0, 1]`, in the order of the hello.
     pub zones: Vec<f32>,
+    /// How far each zone is stretched, in `[0, 1]`, where its sum is below 0.
+    #[serde(default)]
+    pub stretched: Vec<f32>,
     /// Expression weights in `[0, 1]` by ARKit name; empty where the feed carries none.
     pub shapes: BTreeMap<String, f32>,
     /// Head pose.
@@ -156,7 +159,7 @@ impl ViewHello {
                     })
                     .collect(),
                 groups: character.groups.iter().map(|group| group.iter().map(name_of).collect()).collect(),
-                zones: Vec::new(),
+                zones: character.zones.iter().flat_map(|zones| &zones.list).map(|zone| zone.name.clone()).collect(),
                 shapes: character.shapes.iter().map(|shape| shape.shape.name().to_owned()).collect(),
             },
         }
@@ -182,6 +185,7 @@ impl JsonFrame {
                 .collect(),
             influence: frame.influences.chunks(num_bones).map(<[f32]>::to_vec).collect(),
             zones: frame.zones.clone(),
+            stretched: frame.stretched.clone(),
             shapes: frame
                 .shapes
                 .iter()

@@ -24,7 +24,7 @@ fn replay(config: &SolveConfig) -> Replay {
     let mut feed = Feed::open(&path, &character).expect("the demo session is in the project");
     let hello = feed.hello.clone();
     let mut pipeline = Pipeline::new(character, config, &hello, 1).expect("the session fits the character");
-    let mut frame = TrackingFrame { t: 0.0, data: TrackingData::NoFace };
+    let mut frame = TrackingFrame::new(0.0, TrackingData::NoFace);
     let (mut hash, mut packet) = (Sha256::new(), Vec::new());
     let mut replay = Replay { sha256: String::new(), num_packets: 0, num_key_packets: 0, num_bytes: 0 };
     while let Some(item) = feed.next_frame(&mut frame).expect("the demo session has no bad line") {

@@ -30,6 +30,7 @@ mod surface;
 mod teeth;
 mod uv;
 mod weights;
+mod zones;
 
 use anyhow::{Context, Result, ensure};
 use bust::Region;
@@ -86,6 +87,7 @@ fn bake(source: &mut source::Source) -> Result<Vec<u8>> {
         groups: rig.groups.clone(),
         poses,
         correctives: Vec::new(),
+        zones: None,
         evaluation: schema::Evaluation::default(),
     };
     let bytes = glb::write(glb::Contents { parts: &parts, rig, face, painted: &painted, copyright: COPYRIGHT });

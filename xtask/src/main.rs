@@ -1,6 +1,7 @@
-//! Developer commands: `cargo xtask demo | test | setup | bake`.
+//! Developer commands: `cargo xtask demo | test | setup | bake | convert`.
 
 mod bake;
+mod convert;
 mod demo;
 mod setup;
 
@@ -30,6 +31,8 @@ enum Task {
     Setup,
     /// Make the default character, shared/assets/default.glb, from its CC0 sources
     Bake,
+    /// Turn a normal map into partial derivatives or differences and back, and say what that lost
+    Convert(convert::Conversion),
 }
 
 fn main() -> ExitCode {
@@ -38,6 +41,7 @@ fn main() -> ExitCode {
         Task::Test { arguments } => test(&arguments),
         Task::Setup => setup::run(),
         Task::Bake => bake::run(),
+        Task::Convert(conversion) => convert::run(&conversion),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -16,7 +16,7 @@ struct Need {
     without: &'static str,
 }
 
-const NEEDS: [Need; 3] = [
+const NEEDS: [Need; 4] = [
     Need {
         what: "a Vulkan driver",
         packages: &["libvulkan1", "mesa-vulkan-drivers"],
@@ -34,6 +34,12 @@ const NEEDS: [Need; 3] = [
         packages: &["xvfb", "xauth"],
         is_here: || is_on_path("Xvfb") && is_on_path("xvfb-run"),
         without: "the window's test shows as ignored",
+    },
+    Need {
+        what: "SPIR-V tools, which count a shader's instructions",
+        packages: &["spirv-tools"],
+        is_here: || is_on_path("spirv-opt"),
+        without: "the test of the shaders' cost shows as ignored",
     },
 ];
 

@@ -4,7 +4,7 @@ use super::gradients::weight_gradients;
 use super::joints::{JointMotion, Palette};
 use super::mips::{MipChain, Texels};
 use super::morphs::{MorphedMesh, Morphs};
-use super::{Alpha, AssetError, CharacterAsset, MaterialAsset, PrimitiveAsset, Surface, Vertex, WrinkleMaps};
+use super::{Alpha, AssetError, CharacterAsset, MaterialAsset, PrimitiveAsset, Surface, Vertex, WrinkleMaps, ZoneMaps};
 use glam::{Vec2, Vec3};
 use image::RgbaImage;
 use rhytid_shared::{ArkitShape, Character, CharacterError};
@@ -43,7 +43,8 @@ pub(super) fn load(bytes: &[u8]) -> Result<CharacterAsset> {
         }
     }
     let wrinkles = read_wrinkles(&character, &mut images)?;
-    Ok(CharacterAsset { character: Arc::new(character), primitives, palette, morphs, wrinkles })
+    let zones = read_zones(&character, &mut images)?;
+    Ok(CharacterAsset { character: Arc::new(character), primitives, palette, morphs, wrinkles, zones })
 }
 
 /// Names from a joint up to the root.
@@ -310,6 +311,37 @@ fn surface_map(occlusion: Option<RgbaImage>, roughness: Option<RgbaImage>) -> Op
     let (occlusion, roughness) = (scaled(occlusion), scaled(roughness));
     let texels = occlusion.pixels().zip(roughness.pixels()).flat_map(|(occlusion, roughness)| [occlusion[0], roughness[1]]).collect();
     Some(MipChain::from_texels([largest.0, largest.1], Texels::Linear2, texels))
+}
+
+fn read_zones(character: &Character, images: &mut Images<'_>) -> Result<Option<ZoneMaps>> {
+    let Some(zones) = &character.zones else { return Ok(None) };
+    let mut chain = |texture: usize, texels| images.of_texture(texture).map(|image| image.map(|image| MipChain::new(image, texels)));
+    let Some(map) = chain(zones.map.texture, Texels::Slopes)? else { return Ok(None) };
+    let Some(first) = zones.masks.first().and_then(|mask| chain(*mask, Texels::Linear4).transpose()).transpose()? else { return Ok(None) };
+    let second = match zones.masks.get(1) {
+        Some(mask) => chain(*mask, Texels::Linear4)?,
+        None => None,
+    };
+    let stretch = match zones.stretch {
+        Some(stretch) => chain(stretch.texture, Texels::Slopes)?,
+        None => None,
+    };
+    let difference = match zones.difference {
+        Some(difference) => chain(difference, Texels::Linear4)?,
+        None => None,
+    };
+    Ok(Some(ZoneMaps {
+        stretch_scale: if stretch.is_some() { zones.stretch.map_or(0.0, |stretch| stretch.scale) } else { 0.0 },
+        stretch: stretch.unwrap_or_else(|| MipChain::uniform(map.size, Texels::Slopes, &[FLAT_CODE; 2])),
+        masks: {
+            let second = second.unwrap_or_else(|| MipChain::uniform(first.size, Texels::Linear4, &[0; 4]));
+            [first, second]
+        },
+        map,
+        scale: zones.map.scale,
+        difference,
+        wavelength: zones.wavelength,
+    }))
 }
 
 fn read_wrinkles(character: &Character, images: &mut Images<'_>) -> Result<Option<WrinkleMaps>> {

@@ -11,13 +11,15 @@ pub enum Texels {
     Slopes,
     /// Linear values in red and green (occlusion, roughness). 2 bytes.
     Linear2,
+    /// Four linear values (masks, differences of normals). 4 bytes.
+    Linear4,
 }
 
 impl Texels {
     /// Bytes a texel.
     pub fn size(self) -> usize {
         match self {
-            Self::AlbedoSrgb => 4,
+            Self::AlbedoSrgb | Self::Linear4 => 4,
             Self::Slopes | Self::Linear2 => 2,
         }
     }
@@ -38,7 +40,7 @@ impl MipChain {
     /// The chain of a picture; kinds of two bytes take its red and green.
     pub fn new(image: &RgbaImage, texels: Texels) -> Self {
         let base = match texels {
-            Texels::AlbedoSrgb => image.as_raw().clone(),
+            Texels::AlbedoSrgb | Texels::Linear4 => image.as_raw().clone(),
             Texels::Slopes | Texels::Linear2 => image.as_raw().as_chunks::<4>().0.iter().flat_map(|&[r, g, _, _]| [r, g]).collect(),
         };
         Self::from_texels([image.width(), image.height()], texels, base)
@@ -84,6 +86,11 @@ fn halve(from: &[u8], [width, height]: [u32; 2], [to_width, to_height]: [u32; 2]
                     for channel in 0..2 {
                         let sum: u32 = four.iter().map(|texel| u32::from(texel[channel])).sum();
                         to.push(quarter(sum));
+                    }
+                }
+                Texels::Linear4 => {
+                    for channel in 0..4 {
+                        to.push(quarter(four.iter().map(|texel| u32::from(texel[channel])).sum()));
                     }
                 }
                 Texels::AlbedoSrgb => {

@@ -126,8 +126,15 @@ mod tests {
     use std::time::Duration;
 
     fn moment(k: u64, influence: f32) -> Moment {
-        let frame =
-            RenderFrame { points: Vec::new(), rotations: Vec::new(), influences: vec![influence], shapes: None, head: Default::default() };
+        let frame = RenderFrame {
+            points: Vec::new(),
+            rotations: Vec::new(),
+            influences: vec![influence],
+            zones: Vec::new(),
+            stretched: Vec::new(),
+            shapes: None,
+            head: Default::default(),
+        };
         Moment { at: Duration::from_secs(k), frame }
     }
 

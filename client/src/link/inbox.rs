@@ -137,6 +137,7 @@ mod tests {
                 rotations: vec![Quat::IDENTITY],
                 influences: vec![0.0],
                 zones: Vec::new(),
+                stretched: Vec::new(),
                 shapes: None,
                 head: HeadPose::default(),
             };

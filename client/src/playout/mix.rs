@@ -17,6 +17,12 @@ pub(super) fn mix(a: &RenderFrame, b: &RenderFrame, u: f32, out: &mut RenderFram
     for ((out, a), b) in out.influences.iter_mut().zip(&a.influences).zip(&b.influences) {
         *out = lerp(*a, *b, u);
     }
+    for ((out, a), b) in out.zones.iter_mut().zip(&a.zones).zip(&b.zones) {
+        *out = lerp(*a, *b, u);
+    }
+    for ((out, a), b) in out.stretched.iter_mut().zip(&a.stretched).zip(&b.stretched) {
+        *out = lerp(*a, *b, u);
+    }
     out.head.rotation = a.head.rotation.lerp(b.head.rotation, u);
     out.head.position = a.head.position.lerp(b.head.position, u);
     out.shapes = match (&a.shapes, &b.shapes) {

@@ -61,6 +61,14 @@ impl Camera {
         self.target + Quat::from_rotation_y(self.yaw) * Quat::from_rotation_x(-self.pitch) * Vec3::Z * self.distance
     }
 
+    /// How much of wrinkles `wavelength` metres apart is drawn in a picture `height` pixels high: all of them where one
+    /// covers four pixels, none below two, where they could not be told apart.
+    pub fn wrinkle_fade(&self, wavelength: f32, height: u32) -> f32 {
+        let metres_per_pixel = 2.0 * self.distance * (0.5 * self.fovy).tan() / height as f32;
+        let t = ((wavelength / metres_per_pixel - 2.0) / 2.0).clamp(0.0, 1.0);
+        t * t * (3.0 - 2.0 * t)
+    }
+
     /// World to clip space (depth 0 at the near plane, 1 at the far plane).
     pub fn clip_from_world(&self, aspect: f32) -> Mat4 {
         let view_from_world = view::look_at_mat4(self.eye(), self.target, Vec3::Y);
@@ -89,6 +97,15 @@ mod tests {
         let eye = camera.eye();
         assert!(eye.x > 0.4 && eye.y > 1.7 && eye.z > 0.5, "{eye}");
         assert!((eye.distance(camera.target) - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn wrinkles_fade_where_they_cover_few_pixels() {
+        for (distance, expected) in [(2.0, 1.0), (4.0, 0.51721784), (6.0, 0.00017484)] {
+            let camera = Camera { distance, fovy: 30.0_f32.to_radians(), ..camera() };
+            let fade = camera.wrinkle_fade(0.006, 1080);
+            assert!((fade - expected).abs() < 2e-5, "{distance} m: {fade}");
+        }
     }
 
     #[test]

@@ -12,6 +12,10 @@ pub struct RenderFrame {
     pub rotations: Vec<Quat>,
     /// `o * n` influences in `[0, 1]`, pose-major: `influences[k * n + i]`.
     pub influences: Vec<f32>,
+    /// Zone weights in `[0, 1]`; empty for a character without zones.
+    pub zones: Vec<f32>,
+    /// As many again: how far each zone is stretched.
+    pub stretched: Vec<f32>,
     /// Expression weights in `[0, 1]` in the order of [`rhytid_shared::ARKIT_NAMES`], where the feed carries them.
     pub shapes: Option<[f32; NUM_ARKIT_SHAPES]>,
     /// Head pose.
@@ -27,7 +31,12 @@ impl RenderFrame {
     /// True where the arrays have the lengths this character needs.
     pub fn fits(&self, character: &Character) -> bool {
         let num_bones = character.num_bones();
-        self.points.len() == num_bones && self.rotations.len() == num_bones && self.influences.len() == num_bones * character.num_poses()
+        let num_zones = character.num_zones();
+        self.points.len() == num_bones
+            && self.rotations.len() == num_bones
+            && self.influences.len() == num_bones * character.num_poses()
+            && self.zones.len() == num_zones
+            && self.stretched.len() == num_zones
     }
 }
 
@@ -37,6 +46,8 @@ impl From<&FaceFrame> for RenderFrame {
             points: frame.points.clone(),
             rotations: frame.rotations.clone(),
             influences: frame.influences.clone(),
+            zones: frame.zones.clone(),
+            stretched: frame.stretched.clone(),
             shapes: frame.shapes,
             head: frame.head,
         }

@@ -1,6 +1,7 @@
 //! What passes that cover the whole picture have in common.
 
 use super::layouts::{binding, texture};
+use super::timing::Pass;
 
 /// A picture that is filtered.
 pub fn filtered_picture(at: u32) -> wgpu::BindGroupLayoutEntry {
@@ -75,13 +76,14 @@ pub fn pipeline(
 /// Records such a pass.
 pub fn draw(
     encoder: &mut wgpu::CommandEncoder,
-    label: &str,
+    pass: Pass,
     pipeline: &wgpu::RenderPipeline,
     group: &wgpu::BindGroup,
     target: &wgpu::TextureView,
+    stamps: Option<wgpu::RenderPassTimestampWrites<'_>>,
 ) {
     let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
-        label: Some(label),
+        label: Some(pass.name()),
         color_attachments: &[Some(wgpu::RenderPassColorAttachment {
             view: target,
             depth_slice: None,
@@ -89,7 +91,7 @@ pub fn draw(
             ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color::BLACK), store: wgpu::StoreOp::Store },
         })],
         depth_stencil_attachment: None,
-        timestamp_writes: None,
+        timestamp_writes: stamps,
         occlusion_query_set: None,
         multiview_mask: None,
     });

@@ -1,7 +1,7 @@
 //! Pictures without a window.
 
 use super::read_back::read_back;
-use super::{DrawSettings, RenderFrame, Renderer};
+use super::{DrawSettings, Pass, PassTimer, RenderFrame, Renderer};
 use crate::asset::CharacterAsset;
 use image::RgbaImage;
 
@@ -91,7 +91,7 @@ impl Headless {
         let consequences = self.device.push_error_scope(wgpu::ErrorFilter::Validation);
         let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let target = self.target(size)?;
-        let encoder = self.record(&target, size, settings, frame);
+        let encoder = self.record(&target, size, settings, frame, None);
         if pollster::block_on(memory.pop()).is_some() {
             return Err(RenderError::OutOfMemory { got: size });
         }
@@ -104,9 +104,45 @@ impl Headless {
     /// Draws one picture, waits for it and drops it: for who measures drawing.
     pub fn draw_only(&mut self, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> Result<(), RenderError> {
         let target = self.target(size)?;
-        let encoder = self.record(&target, size, settings, frame);
+        let encoder = self.record(&target, size, settings, frame, None);
         self.queue.submit([encoder.finish()]);
         self.wait()
+    }
+
+    /// Draws one picture and gives the milliseconds each pass took on the device, in the order of [`Pass::ALL`]; `None`
+    /// where it has no time stamps.
+    pub fn pass_times(
+        &mut self,
+        size: [u32; 2],
+        settings: &DrawSettings,
+        frame: &RenderFrame,
+    ) -> Result<Option<[f64; Pass::ALL.len()]>, RenderError> {
+        let Some(timer) = PassTimer::new(&self.device, &self.queue) else { return Ok(None) };
+        let target = self.target(size)?;
+        let mut encoder = self.record(&target, size, settings, frame, Some(&timer));
+        let buffer = timer.resolve(&self.device, &mut encoder);
+        self.queue.submit([encoder.finish()]);
+        let (sender, receiver) = std::sync::mpsc::channel();
+        buffer.map_async(wgpu::MapMode::Read, .., move |result| {
+            // Whoever waited has gone if this fails.
+            let _ = sender.send(result);
+        });
+        self.wait()?;
+        let mapped = receiver.recv().map_err(|error| error.to_string()).and_then(|result| result.map_err(|error| error.to_string()));
+        mapped.map_err(RenderError::ReadBack)?;
+        let range = buffer.get_mapped_range(..).map_err(|error| RenderError::ReadBack(error.to_string()))?;
+        let stamps: Vec<u64> = bytemuck::pod_collect_to_vec(&range);
+        Ok(Some(timer.milliseconds(&stamps)))
+    }
+
+    /// Bytes of the zones' masks and of their wrinkle map.
+    pub fn zone_bytes(&self) -> u64 {
+        self.renderer.zone_bytes()
+    }
+
+    /// Draw calls of the last picture.
+    pub fn num_draws(&self) -> u32 {
+        self.renderer.num_draws()
     }
 
     /// Bytes of buffers and textures the renderer holds on the device.
@@ -131,10 +167,17 @@ impl Headless {
         }))
     }
 
-    fn record(&mut self, target: &wgpu::Texture, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> wgpu::CommandEncoder {
+    fn record(
+        &mut self,
+        target: &wgpu::Texture,
+        size: [u32; 2],
+        settings: &DrawSettings,
+        frame: &RenderFrame,
+        timer: Option<&PassTimer>,
+    ) -> wgpu::CommandEncoder {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("headless frame") });
         let view = target.create_view(&wgpu::TextureViewDescriptor::default());
-        self.renderer.draw(&self.device, &self.queue, &mut encoder, &view, size, settings, frame);
+        self.renderer.draw(&self.device, &self.queue, &mut encoder, &view, size, settings, frame, timer);
         encoder
     }
 
@@ -156,12 +199,18 @@ async fn open_device(choice: AdapterChoice) -> Result<(wgpu::AdapterInfo, wgpu::
     let (device, queue) = adapter
         .request_device(&wgpu::DeviceDescriptor {
             label: Some("rhytid headless"),
+            required_features: optional_features(&adapter) | (adapter.features() & wgpu::Features::TIMESTAMP_QUERY),
             required_limits: required_limits(&adapter),
             ..Default::default()
         })
         .await
         .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
     Ok((info, device, queue))
+}
+
+/// What the renderer uses where an adapter has it.
+pub fn optional_features(adapter: &wgpu::Adapter) -> wgpu::Features {
+    adapter.features() & wgpu::Features::TEXTURE_COMPRESSION_BC
 }
 
 /// What WebGL2 guarantees, with textures as large as the adapter has them.

@@ -50,6 +50,10 @@ impl Layouts {
                 binding(4, Stages::FRAGMENT, sampler),
                 binding(5, Stages::VERTEX, texture(wgpu::TextureSampleType::Float { filterable: false }, wgpu::TextureViewDimension::D2)),
                 uniform(6, Stages::VERTEX, size_of::<uniforms::MorphWeights>()),
+                binding(7, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
+                binding(8, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
+                binding(9, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),
+                uniform(10, Stages::FRAGMENT, size_of::<uniforms::ZoneWeights>()),
             ],
         );
         let map = |at| binding(at, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2));

@@ -40,6 +40,10 @@ pub struct Key {
     pub has_coverage: bool,
     /// Poses whose maps are read, one bit each.
     pub poses: u8,
+    /// How zones are blended, as the shader counts it; 0 for none.
+    pub zones: u8,
+    /// Stretched zones have a map.
+    pub has_stretch: bool,
 }
 
 /// The pass that draws a surface.
@@ -131,7 +135,13 @@ impl Pipelines {
                 Look::Influence => (Pass::Influence, "vs_wrinkled", "fs_influence", 0),
                 Look::Normals(blend) => (Pass::Normals, "vs_wrinkled", "fs_wrinkled", blend),
             };
-            let constants = [("NUM_POSES", self.num_poses as f64), ("BLEND", blend as f64), ("POSES", f64::from(key.poses))];
+            let constants = [
+                ("NUM_POSES", self.num_poses as f64),
+                ("BLEND", blend as f64),
+                ("POSES", f64::from(key.poses)),
+                ("ZONES", f64::from(key.zones)),
+                ("ZONES_STRETCH", f64::from(u8::from(key.has_stretch))),
+            ];
             scene_pipeline(
                 device,
                 &SceneParts {
@@ -187,19 +197,23 @@ fn module<'a>(modules: &'a mut BTreeMap<Pass, wgpu::ShaderModule>, device: &wgpu
 
 impl Key {
     /// What no pose can wrinkle, and all that is not skin, is drawn bare when the face is drawn with wrinkles.
-    pub fn new(look: Look, surface: Surface, is_double_sided: bool, alpha: Alpha, poses: u8) -> Self {
+    pub fn new(look: Look, surface: Surface, is_double_sided: bool, alpha: Alpha, poses: u8, (zones, has_stretch): (u8, bool)) -> Self {
         let shader = ShaderKind::from(surface);
         let look = match look {
-            Look::Wrinkled(_) if shader != ShaderKind::Skin || poses == 0 => Look::Bare,
+            Look::Wrinkled(_) if shader != ShaderKind::Skin || (poses == 0 && zones == 0) => Look::Bare,
             look => look,
         };
         let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
+        let is_wrinkled = matches!(look, Look::Wrinkled(_) | Look::Normals(_)) && shader == ShaderKind::Skin;
+        let zones = if is_wrinkled { zones } else { 0 };
         Self {
+            zones,
+            has_stretch: zones != 0 && has_stretch,
             look,
             shader: if is_lit { shader } else { ShaderKind::Plain },
             is_double_sided,
             has_coverage: is_lit && alpha == Alpha::Coverage && shader == ShaderKind::Hair,
-            poses: if matches!(look, Look::Wrinkled(_) | Look::Normals(_)) { poses } else { 0 },
+            poses: if is_wrinkled { poses } else { 0 },
         }
     }
 }

@@ -4,6 +4,7 @@ use super::fullscreen::{self, filtered_picture};
 use super::layouts::uniform;
 use super::pipelines::SCENE_FORMAT;
 use super::targets::Targets;
+use super::timing::Pass;
 use super::uniforms;
 use super::upload::entry;
 use glam::Vec3;
@@ -61,7 +62,7 @@ pub fn kernel(count: usize) -> Vec<KernelSample> {
 
 /// Pipeline and blocks of both draws.
 #[derive(Debug)]
-pub struct Scattering {
+pub(super) struct Scattering {
     pipeline: wgpu::RenderPipeline,
     pub layout: wgpu::BindGroupLayout,
     /// Across and up.
@@ -71,7 +72,7 @@ pub struct Scattering {
 
 /// What the draws need to know of the picture.
 #[derive(Debug, Clone, Copy)]
-pub struct Lens {
+pub(super) struct Lens {
     /// Width over height.
     pub aspect: f32,
     /// Vertical field of view, radians.
@@ -121,9 +122,14 @@ impl Scattering {
     }
 
     /// Records both draws: from the diffuse picture to the scratch one and on to the scattered one.
-    pub fn draw(&self, encoder: &mut wgpu::CommandEncoder, targets: &Targets) {
-        fullscreen::draw(encoder, "scatter across", &self.pipeline, &targets.scatter_groups[0], &targets.scratch);
-        fullscreen::draw(encoder, "scatter up", &self.pipeline, &targets.scatter_groups[1], &targets.scattered);
+    pub fn draw(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        targets: &Targets,
+        [across, up]: [Option<wgpu::RenderPassTimestampWrites<'_>>; 2],
+    ) {
+        fullscreen::draw(encoder, Pass::ScatterAcross, &self.pipeline, &targets.scatter_groups[0], &targets.scratch, across);
+        fullscreen::draw(encoder, Pass::ScatterUp, &self.pipeline, &targets.scatter_groups[1], &targets.scattered, up);
     }
 
     /// Groups of both draws.

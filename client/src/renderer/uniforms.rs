@@ -127,6 +127,17 @@ impl MorphWeights {
     }
 }
 
+/// Zone weights, four a vec4 as in the masks.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct ZoneWeights {
+    /// How strongly each zone's wrinkles show, times the map's largest slope.
+    pub wrinkled: [[f32; 4]; 2],
+    /// How far each zone is stretched, times the largest slope of that map.
+    pub stretched: [[f32; 4]; 2],
+}
+assert_layout!(ZoneWeights, zone_weights, { wrinkled: WRINKLED, stretched: STRETCHED });
+
 /// Group 2.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]

@@ -5,6 +5,7 @@ use super::layouts::Layouts;
 use super::regions::{self, Region};
 use super::uniforms;
 use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, Morphs, PrimitiveAsset, Surface, Texels};
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use wgpu::util::DeviceExt;
 
@@ -45,6 +46,9 @@ pub struct CharacterGroup {
     pub palette: wgpu::Buffer,
     pub coefficients: wgpu::Buffer,
     pub morph_weights: wgpu::Buffer,
+    pub zone_weights: wgpu::Buffer,
+    /// Bytes of the zones' masks and of their wrinkle map.
+    pub zone_bytes: u64,
     pub group: wgpu::BindGroup,
 }
 
@@ -66,6 +70,46 @@ impl Uploader<'_> {
 
     /// Layers of the same size and kind as one array texture. Levels larger than the device takes are left out.
     fn texture(&mut self, label: &str, layers: &[&MipChain]) -> wgpu::Texture {
+        let format = match layers[0].texels {
+            Texels::AlbedoSrgb => wgpu::TextureFormat::Rgba8UnormSrgb,
+            Texels::Slopes | Texels::Linear2 => wgpu::TextureFormat::Rg8Unorm,
+            Texels::Linear4 => wgpu::TextureFormat::Rgba8Unorm,
+        };
+        self.texture_of(label, layers, format, |chain, level, _| chain.levels[level].as_slice().into())
+    }
+
+    /// As [`Uploader::texture`], compressed in blocks where the device has those: slopes as BC5, four values as BC3.
+    fn compressed_texture(&mut self, label: &str, layers: &[&MipChain]) -> wgpu::Texture {
+        let is_in_blocks = layers[0].size.iter().all(|side| side % 4 == 0);
+        if !is_in_blocks || !self.device.features().contains(wgpu::Features::TEXTURE_COMPRESSION_BC) {
+            return self.texture(label, layers);
+        }
+        let (format, encoder) = match layers[0].texels {
+            Texels::Slopes | Texels::Linear2 => (wgpu::TextureFormat::Bc5RgUnorm, texpresso::Format::Bc5),
+            Texels::AlbedoSrgb => (wgpu::TextureFormat::Bc3RgbaUnormSrgb, texpresso::Format::Bc3),
+            Texels::Linear4 => (wgpu::TextureFormat::Bc3RgbaUnorm, texpresso::Format::Bc3),
+        };
+        self.texture_of(label, layers, format, |chain, level, [width, height]| {
+            let rgba: Vec<u8> = match chain.texels.size() {
+                2 => chain.levels[level].as_chunks::<2>().0.iter().flat_map(|&[r, g]| [r, g, 0, 255]).collect(),
+                _ => chain.levels[level].clone(),
+            };
+            // Masks are four maps in one: each channel counts the same.
+            let params = texpresso::Params { algorithm: texpresso::Algorithm::ClusterFit, weights: [1.0; 3], weigh_colour_by_alpha: false };
+            let mut blocks = vec![0; encoder.compressed_size(width as usize, height as usize)];
+            encoder.compress(&rgba, width as usize, height as usize, params, &mut blocks);
+            blocks.into()
+        })
+    }
+
+    /// `encoded` gives the bytes of a level of a chain, whose size in texels it is told.
+    fn texture_of(
+        &mut self,
+        label: &str,
+        layers: &[&MipChain],
+        format: wgpu::TextureFormat,
+        encoded: impl for<'a> Fn(&'a MipChain, usize, [u32; 2]) -> Cow<'a, [u8]>,
+    ) -> wgpu::Texture {
         let most = self.device.limits().max_texture_dimension_2d;
         let first = layers[0];
         let side_at = |level: usize, axis: usize| (first.size[axis] >> level).max(1);
@@ -76,16 +120,16 @@ impl Uploader<'_> {
             mip_level_count: (first.levels.len() - skipped) as u32,
             sample_count: 1,
             dimension: wgpu::TextureDimension::D2,
-            format: match first.texels {
-                Texels::AlbedoSrgb => wgpu::TextureFormat::Rgba8UnormSrgb,
-                Texels::Slopes | Texels::Linear2 => wgpu::TextureFormat::Rg8Unorm,
-            },
+            format,
             usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
             view_formats: &[],
         });
+        let (block_width, _) = format.block_dimensions();
+        let block_bytes = format.block_copy_size(None).unwrap_or(4);
         for (layer, chain) in layers.iter().enumerate() {
-            for (level, texels) in chain.levels.iter().enumerate().skip(skipped) {
+            for level in skipped..chain.levels.len() {
                 let size = wgpu::Extent3d { width: side_at(level, 0), height: side_at(level, 1), depth_or_array_layers: 1 };
+                let bytes = encoded(chain, level, [size.width, size.height]);
                 self.queue.write_texture(
                     wgpu::TexelCopyTextureInfo {
                         texture: &texture,
@@ -93,15 +137,15 @@ impl Uploader<'_> {
                         origin: wgpu::Origin3d { x: 0, y: 0, z: layer as u32 },
                         aspect: wgpu::TextureAspect::All,
                     },
-                    texels,
+                    &bytes,
                     wgpu::TexelCopyBufferLayout {
                         offset: 0,
-                        bytes_per_row: Some(size.width * chain.texels.size() as u32),
+                        bytes_per_row: Some(size.width.div_ceil(block_width) * block_bytes),
                         rows_per_image: None,
                     },
-                    size,
+                    size.physical_size(format),
                 );
-                self.bytes += texels.len() as u64;
+                self.bytes += bytes.len() as u64;
             }
         }
         texture
@@ -123,6 +167,27 @@ impl Uploader<'_> {
         let sampler = self.map_sampler("wrinkle sampler");
         let morph_deltas = self.morph_deltas(&asset.morphs);
         let morph_weights = self.uniform("morph weights", size_of::<uniforms::MorphWeights>());
+        let zone_weights = self.uniform("zone weights", size_of::<uniforms::ZoneWeights>());
+        let (no_mask, no_difference) =
+            (MipChain::uniform([1, 1], Texels::Linear4, &[0; 4]), MipChain::uniform([1, 1], Texels::Linear4, &[128; 4]));
+        let before = self.bytes;
+        let (masks, zone_maps, difference) = match &asset.zones {
+            Some(zones) => {
+                let masks = self.compressed_texture("zone masks", &[&zones.masks[0], &zones.masks[1]]);
+                // Without a map for stretching one layer is enough.
+                let layers: &[&MipChain] = if zones.stretch_scale > 0.0 { &[&zones.map, &zones.stretch] } else { &[&zones.map] };
+                let maps = self.compressed_texture("zone maps", layers);
+                (masks, maps, zones.difference.as_ref())
+            }
+            None => (self.texture("no masks", &[&no_mask, &no_mask]), self.texture("no zones", &[&flat]), None),
+        };
+        let zone_bytes = self.bytes - before;
+        let difference = self.texture("zone differences", &[difference.unwrap_or(&no_difference)]);
+        let array = |texture: &wgpu::Texture| {
+            texture.create_view(&wgpu::TextureViewDescriptor { dimension: Some(wgpu::TextureViewDimension::D2Array), ..Default::default() })
+        };
+        let (masks, zone_maps, difference) =
+            (array(&masks), array(&zone_maps), difference.create_view(&wgpu::TextureViewDescriptor::default()));
         let group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("character"),
             layout: &layouts.character,
@@ -134,9 +199,13 @@ impl Uploader<'_> {
                 entry(4, wgpu::BindingResource::Sampler(&sampler)),
                 entry(5, wgpu::BindingResource::TextureView(&morph_deltas)),
                 entry(6, morph_weights.as_entire_binding()),
+                entry(7, wgpu::BindingResource::TextureView(&masks)),
+                entry(8, wgpu::BindingResource::TextureView(&zone_maps)),
+                entry(9, wgpu::BindingResource::TextureView(&difference)),
+                entry(10, zone_weights.as_entire_binding()),
             ],
         });
-        CharacterGroup { palette, coefficients, morph_weights, group }
+        CharacterGroup { palette, coefficients, morph_weights, zone_weights, zone_bytes, group }
     }
 
     /// The deltas of all shapes; rows are filled up with zeros.

@@ -147,3 +147,87 @@ impl std::str::FromStr for BlendMode {
         Self::ALL.into_iter().find(|mode| mode.name() == text).ok_or_else(|| BlendError(text.to_owned()))
     }
 }
+
+/// Whose wrinkles are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum WrinkleSystem {
+    /// Those of the bones where the character has reference poses with maps, else those of its zones.
+    #[default]
+    Own,
+    /// Those of the bones' reference poses (Dutreve et al. 2009).
+    Bones,
+    /// Those of the zones (Jimenez et al. 2011).
+    Zones,
+    /// Both, one over the other.
+    Both,
+}
+
+/// How the zones' wrinkles are blended over what is there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum ZoneBlend {
+    /// Their partial derivatives are added (Jimenez et al. 2011, 1.2).
+    #[default]
+    PartialDerivatives,
+    /// Differences of unit normals are added and the sum made unit again (1.2.1).
+    Difference,
+    /// Two maps, one for wrinkled and one for stretched skin, by Whiteout (Oat 2007).
+    TwoMaps,
+}
+
+impl ZoneBlend {
+    /// `ZONES` in `wrinkles.wgsl`.
+    pub(super) fn number(self) -> u8 {
+        match self {
+            Self::PartialDerivatives => 1,
+            Self::Difference => 2,
+            Self::TwoMaps => 3,
+        }
+    }
+}
+
+/// A name was none of those expected.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{got:?} is unknown, expected one of: {expected}")]
+pub struct NameError {
+    /// What was given.
+    pub got: String,
+    /// What there is.
+    pub expected: String,
+}
+
+/// Names of the values of an enum, for command lines.
+macro_rules! named {
+    ($ty:ty, [$($value:ident: $name:literal),+ $(,)?]) => {
+        impl $ty {
+            /// All of them, in the order a list should have.
+            pub const ALL: &'static [Self] = &[$(Self::$value),+];
+
+            /// Its name on command lines.
+            pub fn name(self) -> &'static str {
+                match self {
+                    $(Self::$value => $name),+
+                }
+            }
+        }
+
+        impl std::fmt::Display for $ty {
+            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str(self.name())
+            }
+        }
+
+        impl std::str::FromStr for $ty {
+            type Err = NameError;
+
+            fn from_str(text: &str) -> Result<Self, NameError> {
+                Self::ALL.iter().copied().find(|value| value.name() == text).ok_or_else(|| NameError {
+                    got: text.to_owned(),
+                    expected: Self::ALL.iter().map(|value| value.name()).collect::<Vec<_>>().join(", "),
+                })
+            }
+        }
+    };
+}
+
+named!(WrinkleSystem, [Own: "own", Bones: "bones", Zones: "zones", Both: "both"]);
+named!(ZoneBlend, [PartialDerivatives: "pd", Difference: "difference", TwoMaps: "two-maps"]);

@@ -1,8 +1,9 @@
 //! What stands round the face: status, switches, numbers, coefficients.
 
 use super::look::{self, ACCENT, BAD, FAINT, GOOD, PANEL, TEXT, WARN, WELL};
+use super::pages;
 use super::rates::Rate;
-use super::switches::{Switches, views};
+use super::switches::{Page, Switches, views};
 use crate::link::LinkStats;
 use crate::playout::PlayoutStats;
 use crate::renderer::{BlendMode, Deformation, RenderFrame, ViewMode};
@@ -24,6 +25,8 @@ pub(crate) struct Scene<'a> {
     pub(crate) link: LinkStats,
     pub(crate) playout: PlayoutStats,
     pub(crate) rates: &'a Rates,
+    /// Bytes of the zones' masks and of their wrinkle map on the device.
+    pub(crate) zone_bytes: u64,
     /// What draws.
     pub(crate) adapter: &'a str,
     /// The face's picture; drawn into after the layout is known.
@@ -144,18 +147,25 @@ fn contents(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) {
     look::section(ui, "Wrinkles");
     wrinkle_switches(ui, switches);
 
-    look::section(ui, "Deformation");
-    deformation_switches(ui, scene, switches);
-
-    look::section(ui, "Link");
-    numbers(ui, scene);
-
-    look::section(ui, "Reference poses");
-    for (k, pose) in scene.character.poses.iter().enumerate() {
-        pose_bars(ui, scene, k, &pose.name);
-    }
-    if scene.character.poses.is_empty() {
-        ui.label(RichText::new("This character has none.").color(FAINT));
+    look::section(ui, "Page");
+    pages::choice(ui, switches);
+    match switches.page {
+        Page::Face => {
+            look::section(ui, "Deformation");
+            deformation_switches(ui, scene, switches);
+            look::section(ui, "Link");
+            numbers(ui, scene);
+            look::section(ui, "Reference poses");
+            for (k, pose) in scene.character.poses.iter().enumerate() {
+                pose_bars(ui, scene, k, &pose.name);
+            }
+            if scene.character.poses.is_empty() {
+                ui.label(RichText::new("This character has none.").color(FAINT));
+            }
+        }
+        Page::Zones => pages::zones(ui, scene, switches),
+        Page::Light => pages::light(ui, switches),
+        Page::Skin => pages::skin(ui, switches),
     }
 }
 
@@ -308,6 +318,6 @@ fn pose_bars(ui: &mut Ui, scene: &Scene<'_>, k: usize, name: &str) {
 }
 
 fn key_help(ui: &mut Ui) {
-    let text = "1–6 view   W wrinkles   B blend   D deform\nH panel   F full screen   R camera   Esc quit\nDrag to turn, wheel to zoom";
+    let text = "1–6 view   W wrinkles   Z whose   B blend   D deform\nL light   P page   H panel   F full screen   R camera   Esc quit\nDrag to turn, wheel to zoom";
     ui.label(RichText::new(text).small().color(FAINT));
 }

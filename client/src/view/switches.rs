@@ -1,6 +1,6 @@
 //! What the person before the window has chosen.
 
-use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, ViewMode};
+use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, Studio, ViewMode, WrinkleSystem};
 use egui::{Key, Modifiers};
 use rhytid_shared::Character;
 
@@ -11,12 +11,33 @@ pub(crate) struct Switches {
     pub(crate) draw: DrawSettings,
     /// The pose the influence view shows, all where `None`; kept while another view is on.
     pub(crate) pose: Option<usize>,
+    /// What the lower part of the panel shows.
+    pub(crate) page: Page,
     /// The panel is there.
     pub(crate) has_panel: bool,
     /// The window fills the screen.
     pub(crate) is_full_screen: bool,
     /// The window shall close.
     pub(crate) is_quitting: bool,
+}
+
+/// Pages of the panel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Page {
+    /// Numbers of the link and bars of the reference poses.
+    Face,
+    /// Wrinkle zones.
+    Zones,
+    /// Lights and the picture.
+    Light,
+    /// How skin takes light.
+    Skin,
+}
+
+impl Page {
+    /// In the order of the switches.
+    pub(crate) const ALL: [(Self, &'static str); 4] =
+        [(Self::Face, "Face"), (Self::Zones, "Zones"), (Self::Light, "Light"), (Self::Skin, "Skin")];
 }
 
 /// Radians the camera turns for a drag over the height of the picture.
@@ -38,7 +59,14 @@ pub(crate) fn views(pose: Option<usize>) -> [(ViewMode, &'static str); 6] {
 
 impl Switches {
     pub(crate) fn new(character: &Character) -> Self {
-        Self { draw: DrawSettings::new(Camera::front(character)), pose: None, has_panel: true, is_full_screen: false, is_quitting: false }
+        Self {
+            draw: DrawSettings::new(Camera::front(character)),
+            pose: None,
+            page: Page::Face,
+            has_panel: true,
+            is_full_screen: false,
+            is_quitting: false,
+        }
     }
 
     /// Obeys the keys of this frame.
@@ -61,6 +89,18 @@ impl Switches {
                 Deformation::Bones => Deformation::Shapes,
                 Deformation::Shapes => Deformation::Bones,
             };
+        }
+        if pressed(Key::L) {
+            let at = Studio::ALL.iter().position(|&studio| studio == self.draw.studio).unwrap_or(0);
+            self.draw.studio = Studio::ALL[(at + 1) % Studio::ALL.len()];
+        }
+        if pressed(Key::Z) {
+            let at = WrinkleSystem::ALL.iter().position(|&system| system == self.draw.system).unwrap_or(0);
+            self.draw.system = WrinkleSystem::ALL[(at + 1) % WrinkleSystem::ALL.len()];
+        }
+        if pressed(Key::P) {
+            let at = Page::ALL.iter().position(|(page, _)| *page == self.page).unwrap_or(0);
+            self.page = Page::ALL[(at + 1) % Page::ALL.len()].0;
         }
         if pressed(Key::H) {
             self.has_panel = !self.has_panel;
@@ -190,7 +230,10 @@ mod tests {
             assert_eq!(desk.press(Key::B).draw.blend, mode);
         }
         assert_eq!(desk.press(Key::D).draw.deform, Deformation::Shapes);
-        for key in [Key::W, Key::D, Key::H, Key::F] {
+        assert_eq!(desk.press(Key::L).draw.studio, Studio::Sunset);
+        assert_eq!(desk.press(Key::Z).draw.system, WrinkleSystem::Bones);
+        assert_eq!(desk.press(Key::P).page, Page::Zones);
+        for key in [Key::W, Key::D, Key::H, Key::F, Key::L, Key::Z, Key::Z, Key::Z, Key::P, Key::P, Key::P] {
             desk.press(key);
         }
         assert_eq!(desk.switches, before, "pressed again they switch back");

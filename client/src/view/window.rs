@@ -6,7 +6,7 @@ use super::painter::Painter;
 use super::panel::{self, Scene};
 use super::switches::Switches;
 use crate::asset::CharacterAsset;
-use crate::renderer::{RenderError, RenderFrame, Renderer, read_back, required_limits};
+use crate::renderer::{RenderError, RenderFrame, Renderer, optional_features, read_back, required_limits};
 use image::RgbaImage;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -31,6 +31,7 @@ pub(super) struct GpuWindow {
     /// Set by wgpu when the device is gone: a driver that was updated or crashed, a GPU that was unplugged.
     is_lost: Arc<AtomicBool>,
     adapter_name: String,
+    is_software: bool,
     device: wgpu::Device,
     queue: wgpu::Queue,
     renderer: Renderer,
@@ -67,8 +68,12 @@ impl GpuWindow {
         let adapter = pollster::block_on(wgpu::util::initialize_adapter_from_env_or_default(&instance, Some(&surface)))
             .map_err(|error| RenderError::NoAdapter(error.to_string()))?;
         let info = adapter.get_info();
-        let descriptor =
-            wgpu::DeviceDescriptor { label: Some("rhytid window"), required_limits: required_limits(&adapter), ..Default::default() };
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("rhytid window"),
+            required_features: optional_features(&adapter),
+            required_limits: required_limits(&adapter),
+            ..Default::default()
+        };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
 
@@ -111,6 +116,7 @@ impl GpuWindow {
             has_area: size.width > 0 && size.height > 0,
             is_suboptimal: false,
             is_lost,
+            is_software: info.device_type == wgpu::DeviceType::Cpu,
             adapter_name: info.name,
             device,
             queue,
@@ -124,6 +130,11 @@ impl GpuWindow {
     /// The window alone; everything on the device is dropped.
     pub(super) fn into_window(self) -> Arc<Window> {
         self.window
+    }
+
+    /// Bytes of the zones' masks and of their wrinkle map.
+    pub(super) fn zone_bytes(&self) -> u64 {
+        self.renderer.zone_bytes()
     }
 
     /// The window itself.
@@ -258,7 +269,9 @@ impl GpuWindow {
         }
         let most = self.device.limits().max_texture_dimension_2d;
         let pixels = |points: f32| ((points * output.pixels_per_point).round() as u32).clamp(1, most);
-        let face_size = [pixels(face_rect.width()), pixels(face_rect.height())];
+        // A processor that draws has the time for a quarter of the pixels.
+        let share = if self.is_software { 0.5 } else { 1.0 };
+        let face_size = [pixels(face_rect.width() * share), pixels(face_rect.height() * share)];
         if self.face.size != face_size {
             self.face = FaceTexture::new(&self.device, &mut self.painter, face_size, Some(self.face.id));
         }
@@ -275,7 +288,7 @@ impl GpuWindow {
         switches: &Switches,
     ) -> wgpu::CommandEncoder {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("window") });
-        self.renderer.draw(&self.device, &self.queue, &mut encoder, &self.face.view, self.face.size, &switches.draw, frame);
+        self.renderer.draw(&self.device, &self.queue, &mut encoder, &self.face.view, self.face.size, &switches.draw, frame, None);
         let size = [self.surface_config.width, self.surface_config.height];
         self.painter.paint(&self.device, &self.queue, &mut encoder, target, size, pixels_per_point, primitives);
         encoder

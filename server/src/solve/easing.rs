@@ -2,8 +2,10 @@
 
 use super::config::LostConfig;
 use super::weights_to_bones::Weights;
+use super::zones::Amounts;
 use glam::Vec3;
 use rhytid_shared::NUM_ARKIT_SHAPES;
+use rhytid_shared::limits::MAX_EXPRESSIONS;
 
 /// Everything about a face that is eased: linear in each of its numbers.
 #[derive(Debug, Clone, PartialEq)]
@@ -14,16 +16,28 @@ pub(super) struct FaceState {
     /// Rotation vector, then position in metres.
     pub(super) head: [f64; 6],
     pub(super) weights: Option<Weights>,
+    /// Expressions; 0 where nothing is known of them.
+    pub(super) expressions: Amounts,
+    /// How much the influences drive the wrinkle zones: 1 where nothing is known of expressions, else 0, between them while
+    /// one is blended into the other.
+    pub(super) bridge: f32,
     /// True where every motion is a displacement, of turning bones, too: an animator's own bones.
     pub(super) is_placed: bool,
 }
 
 impl FaceState {
     pub(super) fn at_rest(num_bones: usize) -> Self {
-        Self { motions: vec![Vec3::ZERO; num_bones], head: [0.0; 6], weights: None, is_placed: false }
+        Self {
+            motions: vec![Vec3::ZERO; num_bones],
+            head: [0.0; 6],
+            weights: None,
+            expressions: [[0.0; 2]; MAX_EXPRESSIONS],
+            bridge: 1.0,
+            is_placed: false,
+        }
     }
 
-    /// `self = a * share`.
+    /// `self = a * share`, but what drives the zones stays: the influences scale with the motions.
     fn copy_scaled(&mut self, a: &Self, share: f64) {
         for (to, from) in self.motions.iter_mut().zip(&a.motions) {
             *to = *from * share as f32;
@@ -32,6 +46,8 @@ impl FaceState {
             self.head[axis] = a.head[axis] * share;
         }
         self.weights = a.weights.map(|weights| weights.map(|weight| weight * share as f32));
+        self.expressions = a.expressions.map(|halves| halves.map(|amount| amount * share as f32));
+        self.bridge = a.bridge;
         self.is_placed = a.is_placed;
     }
 
@@ -49,6 +65,10 @@ impl FaceState {
                 to[shape] += from[shape] * share as f32;
             }
         }
+        for (to, from) in self.expressions.iter_mut().flatten().zip(b.expressions.iter().flatten()) {
+            *to += from * share as f32;
+        }
+        self.bridge += b.bridge * share as f32;
     }
 }
 

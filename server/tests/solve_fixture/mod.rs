@@ -2,7 +2,9 @@
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
 use glam::{DMat3, DVec3, Vec3};
-use rhytid_shared::character::{Bone, Drive, GroupDegenerate, LandmarkWeight, LidKind, Mode, Pose, ShapeDeltas, Side};
+use rhytid_shared::character::{
+    Bone, BridgeRow, Drive, Expression, GroupDegenerate, LandmarkWeight, LidKind, Mode, Pose, ShapeDeltas, Side, Zone, ZoneMap, Zones,
+};
 use rhytid_shared::layout::{IBUG_MIRROR, Layout, NUM_IBUG};
 use rhytid_shared::{ArkitShape, Character, FaceFrame, HeadPose, PublishHello, TrackingData, TrackingFrame};
 use std::sync::Arc;
@@ -162,16 +164,58 @@ pub fn character() -> Arc<Character> {
         poses,
         shapes,
         correctives: Vec::new(),
+        zones: None,
         mode: Mode::Independent,
         group_degenerate: GroupDegenerate::Exclude,
         falloff: 1.0,
     })
 }
 
+/// The fixture with the paper's eight zones and Table 1.1; stretched and compressed brows drive the forehead of their side.
+pub fn character_with_zones() -> Arc<Character> {
+    let plain = character();
+    let (left, right) = (Some(Side::Left), Some(Side::Right));
+    let list = [
+        ("red", left),
+        ("green", right),
+        ("blue", left),
+        ("brown", right),
+        ("cyan", left),
+        ("magenta", right),
+        ("orange", None),
+        ("gray", None),
+    ];
+    let table: [(&str, [f32; 8]); 6] = [
+        ("joy", [1.0, 1.0, 0.2, 0.2, 0.0, 0.0, 0.0, 0.0]),
+        ("surprise", [0.8, 0.8, 0.8, 0.8, 0.0, 0.0, 0.0, 0.0]),
+        ("fear", [0.2, 0.2, 0.75, 0.75, 0.3, 0.3, 0.0, 0.6]),
+        ("anger", [-0.6, -0.6, -0.8, -0.8, 0.8, 0.8, 1.0, 0.0]),
+        ("disgust", [0.0, 0.0, -0.1, -0.1, 1.0, 1.0, 1.0, 0.5]),
+        ("sad", [0.2, 0.2, 0.75, 0.75, 0.0, 0.0, 0.1, 1.0]),
+    ];
+    let rows = [(0, "brow_mid", 0, 0.5), (0, "brow_outer", 0, 0.5), (0, "brow_inner", 2, 1.0), (1, "brow_inner", 2, -0.8)];
+    let halves = [("_l", 0), ("_r", 1)];
+    let bridge = halves.iter().flat_map(|&(suffix, half)| {
+        let bone = |stem: &str| plain.bone_index(&format!("{stem}{suffix}")).expect("a bone");
+        rows.map(|(pose, stem, zone, gain)| BridgeRow { pose, bone: bone(stem), zone: zone + half, gain })
+    });
+    let zones = Zones {
+        list: list.map(|(name, side)| Zone { name: name.to_owned(), side }).to_vec(),
+        masks: vec![0, 1],
+        map: ZoneMap { texture: 2, scale: 1.0 },
+        stretch: Some(ZoneMap { texture: 3, scale: 1.0 }),
+        difference: None,
+        wavelength: 0.006,
+        expressions: table.map(|(name, weights)| Expression { name: name.to_owned(), weights: weights.to_vec() }).to_vec(),
+        bridge: bridge.collect(),
+    };
+    Arc::new(Character { zones: Some(zones), ..(*plain).clone() })
+}
+
 pub const IMAGE: [f32; 2] = [640.0, 480.0];
 
 pub fn hello(layout: Option<Layout>, focal: Option<f32>) -> PublishHello {
-    PublishHello { source: "test".to_owned(), fps: Some(30.0), layout, image: Some(IMAGE), focal, takeover: false }
+    PublishHello { source: "test".to_owned(), fps: Some(30.0), layout, image: Some(IMAGE), focal, ..PublishHello::default() }
 }
 
 /// A head before a camera.
@@ -213,7 +257,7 @@ pub fn see(points: &[Vec3], pivot: Vec3, view: &View) -> Vec<[f32; 3]> {
 }
 
 pub fn landmark_frame(t: f64, points: Vec<[f32; 3]>) -> TrackingFrame {
-    TrackingFrame { t, data: TrackingData::Landmarks { points, confidence: Vec::new() } }
+    TrackingFrame::new(t, TrackingData::Landmarks { points, confidence: Vec::new() })
 }
 
 pub fn weight_frame(t: f64, named: &[(&str, f32)]) -> TrackingFrame {
@@ -221,7 +265,7 @@ pub fn weight_frame(t: f64, named: &[(&str, f32)]) -> TrackingFrame {
     for (name, weight) in named {
         weights[ArkitShape::from_name(name).expect("a name of ARKit's").index()] = *weight;
     }
-    TrackingFrame { t, data: TrackingData::Weights { weights, head: None::<HeadPose> } }
+    TrackingFrame::new(t, TrackingData::Weights { weights, head: None::<HeadPose> })
 }
 
 /// The landmarks with an expression: brows up by `brow` right and left, lips apart by `open`, corners out by `smile`, lids shut by

@@ -20,6 +20,21 @@ override POSES: u32 = 255u;
 @group(1) @binding(3) var wrinkle_maps: texture_2d_array<f32>;
 @group(1) @binding(4) var wrinkle_sampler: sampler;
 
+// Zone i is component i % 4 of vec4 i / 4, as in the masks.
+struct ZoneWeights {
+    // How strongly each zone's wrinkles show, times the map's largest slope (difference maps: as it is).
+    wrinkled: array<vec4<f32>, 2>,
+    // How far each zone is stretched, times the largest slope of that map.
+    stretched: array<vec4<f32>, 2>,
+}
+
+@group(1) @binding(7) var zone_masks: texture_2d_array<f32>;
+// Partial derivatives: wrinkles, then what stretching takes away.
+@group(1) @binding(8) var zone_maps: texture_2d_array<f32>;
+// Wrinkled less neutral unit normal.
+@group(1) @binding(9) var zone_difference: texture_2d<f32>;
+@group(1) @binding(10) var<uniform> zone_weights: ZoneWeights;
+
 @group(2) @binding(0) var<uniform> material: Material;
 @group(2) @binding(1) var albedo_map: texture_2d<f32>;
 @group(2) @binding(2) var normal_map: texture_2d<f32>;
@@ -88,6 +103,23 @@ fn influence(in: Varyings, pose: u32) -> f32 {
     return in.influences_4_7[pose - 4u];
 }
 
+// Codes as a unorm texture gives them, -1 to 1 with code 128 at zero; no clamp: the bake writes no code 0.
+fn signed_code(texel: vec4<f32>) -> vec4<f32> {
+    return texel * (255.0 / 127.0) - 128.0 / 127.0;
+}
+
+fn zone_amount(uv: vec2<f32>, weights: array<vec4<f32>, 2>) -> f32 {
+    return dot(textureSample(zone_masks, wrinkle_sampler, uv, 0), weights[0]) + dot(textureSample(zone_masks, wrinkle_sampler, uv, 1), weights[1]);
+}
+
+fn zone_slope(uv: vec2<f32>) -> vec2<f32> {
+    var slope = signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 0)).xy * zone_amount(uv, zone_weights.wrinkled);
+    if ZONES_STRETCH == 1u {
+        slope += signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 1)).xy * zone_amount(uv, zone_weights.stretched);
+    }
+    return slope;
+}
+
 fn wrinkled_normal(in: Varyings) -> vec3<f32> {
     var blend = begin_blend(base_slope(in.uv));
     for (var pose = 0u; pose < NUM_POSES; pose += 1u) {
@@ -97,7 +129,18 @@ fn wrinkled_normal(in: Varyings) -> vec3<f32> {
         let map = slope_of(textureSample(wrinkle_maps, wrinkle_sampler, in.uv, pose).xy, pose_table.scales[pose / 4u][pose % 4u]);
         blend = add_wrinkle(blend, map, pose_table.contains_neutral[pose / 4u][pose % 4u], influence(in, pose));
     }
-    return world_from_tangent(in, end_blend(blend));
+    if ZONES == 1u && BLEND == 0u {
+        blend.slope += zone_slope(in.uv);
+        return world_from_tangent(in, end_blend(blend));
+    }
+    var normal = end_blend(blend);
+    if ZONES == 2u {
+        let difference = signed_code(textureSample(zone_difference, wrinkle_sampler, in.uv)).xyz * zone_amount(in.uv, zone_weights.wrinkled);
+        normal = with_zones(normal, vec2<f32>(0.0), difference);
+    } else if ZONES != 0u {
+        normal = with_zones(normal, zone_slope(in.uv), vec3<f32>(0.0));
+    }
+    return world_from_tangent(in, normal);
 }
 
 fn albedo_of(uv: vec2<f32>) -> vec4<f32> {

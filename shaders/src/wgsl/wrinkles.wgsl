@@ -3,6 +3,12 @@
 // 0: sum of partial derivatives. 1: weighted mean of whole normals. 2: Whiteout of base and blended wrinkles.
 override BLEND: u32 = 0u;
 
+// How wrinkle zones are blended over that (Jimenez et al. 2011). 0: there are none. 1: their partial derivatives are added.
+// 2: differences of normals are added. 3: Whiteout of what is there and the zones' wrinkles (Oat 2007).
+override ZONES: u32 = 0u;
+// 1: stretched zones have a map of their own.
+override ZONES_STRETCH: u32 = 0u;
+
 fn normal_of(slope: vec2<f32>) -> vec3<f32> {
     return normalize(vec3<f32>(slope, 1.0));
 }
@@ -15,6 +21,16 @@ fn slope_of(texel: vec2<f32>, scale: f32) -> vec2<f32> {
 // Whiteout (Oat 2007): what Dutreve et al. 2009, 5.3, print.
 fn whiteout(base: vec3<f32>, detail: vec3<f32>) -> vec3<f32> {
     return normalize(vec3<f32>(base.xy + detail.xy, base.z * detail.z));
+}
+
+// The zones' wrinkles over a normal in tangent space: `slope` is theirs, `difference` what they add to a unit normal.
+fn with_zones(normal: vec3<f32>, slope: vec2<f32>, difference: vec3<f32>) -> vec3<f32> {
+    if ZONES == 2u {
+        return normalize(normal + difference);
+    } else if ZONES == 3u {
+        return whiteout(normal, normal_of(slope));
+    }
+    return normal_of(normal.xy / max(normal.z, 0.02) + slope);
 }
 
 // Gathers one map after the other. `slope` and `normal` are sums weighted by influence.

@@ -1,6 +1,7 @@
 //! A character after its checks.
 
 use super::schema::{self, Face};
+use super::zones::{self, Zones};
 use crate::layout::NUM_IBUG;
 use crate::limits::{MAX_BONE_TRAVEL, MAX_BONES, MAX_FEATURE_POINTS, MAX_POSES, MIN_POSE_TRAVEL};
 use crate::names::ArkitShape;
@@ -31,7 +32,7 @@ impl CharacterError {
     }
 }
 
-type Result<T> = std::result::Result<T, CharacterError>;
+pub(super) type Result<T> = std::result::Result<T, CharacterError>;
 
 /// A character, checked. Positions are metres in head space; `n` bones, `o` poses.
 #[derive(Debug, Clone, PartialEq)]
@@ -58,6 +59,8 @@ pub struct Character {
     pub shapes: Vec<ShapeDeltas>,
     /// Authored combinations.
     pub correctives: Vec<Corrective>,
+    /// Wrinkle zones, where the character has them.
+    pub zones: Option<Zones>,
     /// How several poses on one bone share its displacement.
     pub mode: Mode,
     /// What a group member does that a pose does not move.
@@ -205,6 +208,11 @@ impl Character {
         self.poses.len()
     }
 
+    /// Wrinkle zones; 0 for a character without any.
+    pub fn num_zones(&self) -> usize {
+        self.zones.as_ref().map_or(0, |zones| zones.list.len())
+    }
+
     /// Index of the bone called `name`.
     pub fn bone_index(&self, name: &str) -> Option<usize> {
         self.bones.iter().position(|bone| bone.name == name)
@@ -241,6 +249,7 @@ impl Character {
         let groups = check_groups(&face.groups, &index_of)?;
         let poses = check_poses(&face.poses, &bones, &index_of)?;
         let correctives = check_correctives(&face.correctives, &index_of)?;
+        let zones = face.zones.as_ref().map(|given| zones::check(given, &poses, &index_of)).transpose()?;
         let falloff = face.evaluation.falloff;
         if !(falloff > 0.0 && falloff <= 1.0) {
             return Err(CharacterError::field(
@@ -260,6 +269,7 @@ impl Character {
             poses,
             shapes: Vec::new(),
             correctives,
+            zones,
             mode: face.evaluation.mode,
             group_degenerate: face.evaluation.group_degenerate,
             falloff,

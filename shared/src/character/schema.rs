@@ -34,6 +34,9 @@ pub struct Face {
     /// Authored combinations of expression weights and where they put bones.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub correctives: Vec<Corrective>,
+    /// Wrinkle zones ([J11]).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub zones: Option<Zones>,
     /// How influences are computed.
     #[serde(default)]
     pub evaluation: Evaluation,
@@ -156,6 +159,79 @@ pub struct Corrective {
     pub bones: BTreeMap<String, [f32; 3]>,
 }
 
+/// Wrinkle zones ([J11]: Jimenez, Echevarria, Oat, Gutierrez 2011): one wrinkle map for the whole face, and masks that say
+/// which zone each place belongs to. A zone shows with `sum over expressions of amount * weight`, clamped once to `[0, 1]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Zones {
+    /// Up to 8 zones, in the order of the masks' channels: the first four are red, green, blue and alpha of the first mask.
+    pub list: Vec<Zone>,
+    /// Indices into glTF `textures`, one for every four zones begun: squares of 4 to 256 texels (64 in the paper), PNG, linear.
+    /// No texel's channels sum to more than 1 over all zones.
+    pub masks: Vec<usize>,
+    /// The wrinkles of all zones.
+    pub map: ZoneMap,
+    /// What takes the creases out of the neutral face where a zone's sum is below 0 (Oat 2007): added times `-sum`, clamped
+    /// to `[0, 1]`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stretch: Option<ZoneMap>,
+    /// The same wrinkles as differences of unit normals, `wrinkled - neutral` as `(code - 128) / 127` in red, green and blue
+    /// ([J11] 1.2.1): index into glTF `textures`. Only where a viewer is asked for them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub difference: Option<usize>,
+    /// Distance from one wrinkle to the next, metres: where it covers less than a few pixels the wrinkles fade.
+    #[serde(default = "wrinkle_wavelength")]
+    pub wavelength: f32,
+    /// How each expression weighs on each zone ([J11] Table 1.1). What a tracker's weights say about `joy`, `surprise`, `fear`,
+    /// `anger`, `disgust` and `sad` is known; other names show only where a publisher sends them.
+    #[serde(default)]
+    pub expressions: Vec<Expression>,
+    /// How the influences of reference poses weigh on zones where a frame has neither expressions nor expression weights.
+    #[serde(default)]
+    pub bridge: Vec<BridgeRow>,
+}
+
+/// A wrinkle zone.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Zone {
+    /// Unique name; the paper calls its zones by colours.
+    pub name: String,
+    /// The half of the face it lies on; none for one in the middle, which follows the mean of both.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub side: Option<Side>,
+}
+
+/// Partial derivatives (`p = n.xy / n.z`) as `(code - 128) / 127 * scale` in red and green; a square of up to 1,024 texels with
+/// a power of two a side (256 in the paper), the same for all maps of the zones.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ZoneMap {
+    /// Index into glTF `textures`.
+    pub texture: usize,
+    /// Largest slope the codes reach.
+    pub scale: f32,
+}
+
+/// A row of the expression table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Expression {
+    /// Unique name.
+    pub name: String,
+    /// One weight a zone, within ±2. Negative ones take back what other expressions ask for.
+    pub weights: Vec<f32>,
+}
+
+/// A share of a pose's influence at a bone in a zone.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BridgeRow {
+    /// Name of the reference pose.
+    pub pose: String,
+    /// Name of the bone.
+    pub bone: String,
+    /// Name of the zone.
+    pub zone: String,
+    /// What influence 1 adds to the zone's sum, within ±2.
+    pub gain: f32,
+}
+
 /// How influences are computed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
@@ -192,6 +268,11 @@ pub enum GroupDegenerate {
     Exclude,
     /// Counts as 0.
     Zero,
+}
+
+/// Forehead wrinkles lie about 6 mm apart.
+fn wrinkle_wavelength() -> f32 {
+    0.006
 }
 
 fn one() -> [f32; 3] {

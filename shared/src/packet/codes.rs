@@ -25,7 +25,7 @@ pub(super) struct Codes {
     turns: Vec<Rotation>,
     /// One coefficient a slot of the layout, 0 to 255.
     influences: Vec<i32>,
-    /// 0 to 255.
+    /// 0 to 255 where wrinkles show, 0 to -255 where the zone is stretched.
     zones: Vec<i32>,
     /// 0 to 255; all 0 without shapes.
     shapes: [i32; NUM_ARKIT_SHAPES],
@@ -67,6 +67,8 @@ impl Codes {
         let n = layout.rest.len();
         assert_eq!((frame.points.len(), frame.rotations.len()), (n, n), "points and rotations of a face frame");
         assert_eq!(frame.influences.len(), layout.num_poses * n, "influences of a face frame");
+        let num_zones = layout.num_zones;
+        assert_eq!((frame.zones.len(), frame.stretched.len()), (num_zones, num_zones), "zones of a face frame");
         self.face = frame.face;
         self.has_shapes = frame.shapes.is_some();
         for (code, &bone) in self.points.iter_mut().zip(&layout.moving) {
@@ -78,8 +80,8 @@ impl Codes {
         for (code, slot) in self.influences.iter_mut().zip(&layout.slots) {
             *code = unit_code(frame.influences[slot.pose * n + slot.bones[0]]);
         }
-        for (code, zone) in self.zones.iter_mut().zip(&frame.zones) {
-            *code = unit_code(*zone);
+        for ((code, zone), stretched) in self.zones.iter_mut().zip(&frame.zones).zip(&frame.stretched) {
+            *code = unit_code(*zone) - unit_code(*stretched);
         }
         self.shapes = frame.shapes.map_or([0; NUM_ARKIT_SHAPES], |shapes| shapes.map(unit_code));
         self.head_rotation = Rotation::new(frame.head.rotation);
@@ -111,7 +113,9 @@ impl Codes {
             }
         }
         frame.zones.clear();
-        frame.zones.extend(self.zones.iter().map(|code| *code as f32 / 255.0));
+        frame.zones.extend(self.zones.iter().map(|code| (*code).max(0) as f32 / 255.0));
+        frame.stretched.clear();
+        frame.stretched.extend(self.zones.iter().map(|code| (-*code).max(0) as f32 / 255.0));
         frame.shapes = self.has_shapes.then(|| self.shapes.map(|code| code as f32 / 255.0));
         frame.head.rotation = self.head_rotation.rotation();
         frame.head.position = Vec3::from(self.head_position.map(head_value));
@@ -129,7 +133,7 @@ impl Codes {
         self.transfer_influences(base, layout, coder)?;
         let mut zones = Numbers::expecting(3);
         for (code, base) in self.zones.iter_mut().zip(&base.zones) {
-            transfer_code(code, *base, 0..=255, &mut zones, coder)?;
+            transfer_code(code, *base, -255..=255, &mut zones, coder)?;
         }
         if self.has_shapes {
             let mut shapes = Numbers::expecting(3);

@@ -85,7 +85,7 @@ impl From<&Character> for PacketLayout {
             moves: character.poses.iter().map(|pose| pose.points.iter().zip(&rest).map(|(point, rest)| *point - *rest).collect()).collect(),
             rest,
             groups: &character.groups,
-            num_zones: 0,
+            num_zones: character.num_zones(),
         })
     }
 }
@@ -186,6 +186,7 @@ impl PacketLayout {
             rotations: vec![Quat::IDENTITY; self.rest.len()],
             influences: vec![0.0; self.num_poses * self.rest.len()],
             zones: vec![0.0; self.num_zones],
+            stretched: vec![0.0; self.num_zones],
             shapes: None,
             head: HeadPose::default(),
         }

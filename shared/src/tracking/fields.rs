@@ -2,7 +2,8 @@
 //! one frame of 478 points costs more time than everything the solve does with it.
 
 use super::MessageError;
-use crate::limits::{MAX_FEATURE_POINTS, MAX_HEAD_TRAVEL};
+use super::reader::Names;
+use crate::limits::{MAX_EXPRESSIONS, MAX_FEATURE_POINTS, MAX_HEAD_TRAVEL};
 use crate::names::{ArkitShape, NUM_ARKIT_SHAPES};
 use glam::{Quat, Vec3};
 use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
@@ -15,6 +16,8 @@ const MAX_PIXELS: f64 = 1e5;
 const MAX_WEIGHT: f64 = 10.0;
 /// Largest weight passed on; trackers overshoot 1 a little.
 const WEIGHT_CEILING: f64 = 1.2;
+/// Largest amount of an expression, as of a weight.
+const MAX_AMOUNT: f64 = 1.2;
 /// A bone's point this far from the origin of head space, metres, is in another unit.
 const MAX_POINT: f64 = 1.0;
 /// A head this far from its neutral place, metres, is in another unit.
@@ -48,6 +51,7 @@ pub(super) struct Fields {
     pub image: Option<[f64; 2]>,
     pub focal: Option<f64>,
     pub takeover: bool,
+    pub keep_neutral: bool,
     pub t: Option<f64>,
     pub face: Option<bool>,
     pub has_landmarks: bool,
@@ -58,6 +62,9 @@ pub(super) struct Fields {
     pub confidence: Vec<f32>,
     pub has_weights: bool,
     pub weights: Box<[f32; NUM_ARKIT_SHAPES]>,
+    pub has_expressions: bool,
+    /// In the order of the character's table; 0 where it is not known.
+    pub expressions: [f32; MAX_EXPRESSIONS],
     pub has_bones: bool,
     pub bones: Vec<(usize, Vec3)>,
     pub head_rotation: Option<Quat>,
@@ -79,6 +86,7 @@ impl Fields {
             image: None,
             focal: None,
             takeover: false,
+            keep_neutral: false,
             t: None,
             face: None,
             has_landmarks: false,
@@ -88,6 +96,8 @@ impl Fields {
             confidence: Vec::new(),
             has_weights: false,
             weights: Box::new([0.0; NUM_ARKIT_SHAPES]),
+            has_expressions: false,
+            expressions: [0.0; MAX_EXPRESSIONS],
             has_bones: false,
             bones: Vec::new(),
             head_rotation: None,
@@ -101,18 +111,20 @@ impl Fields {
     fn clear(&mut self) {
         self.kind = None;
         (self.version, self.fps, self.focal, self.t) = (None, None, None, None);
-        (self.source, self.layout, self.image, self.takeover) = (None, None, None, false);
+        (self.source, self.layout, self.image) = (None, None, None);
+        (self.takeover, self.keep_neutral) = (false, false);
         self.face = None;
-        (self.has_landmarks, self.has_confidence, self.has_weights, self.has_bones) = (false, false, false, false);
+        (self.has_landmarks, self.has_confidence, self.has_weights) = (false, false, false);
+        (self.has_bones, self.has_expressions) = (false, false);
         (self.head_rotation, self.head_position) = (None, None);
         (self.problem, self.reading) = (None, "");
     }
 
     /// Reads `text`. Broken JSON and wrong types are errors here; broken rules stand in `problem`.
-    pub fn read(&mut self, text: &str, bones: Option<&BTreeMap<String, usize>>) -> Result<(), MessageError> {
+    pub fn read(&mut self, text: &str, names: Option<&Names>) -> Result<(), MessageError> {
         self.clear();
         let mut deserializer = serde_json::Deserializer::from_str(text);
-        let result = deserializer.deserialize_map(MessageVisitor { fields: self, bones });
+        let result = deserializer.deserialize_map(MessageVisitor { fields: self, names });
         let Err(error) = result.and_then(|()| deserializer.end()) else { return Ok(()) };
         let field = self.reading;
         Err(if error.is_data() {
@@ -138,7 +150,7 @@ impl Fields {
 
 struct MessageVisitor<'a> {
     fields: &'a mut Fields,
-    bones: Option<&'a BTreeMap<String, usize>>,
+    names: Option<&'a Names>,
 }
 
 /// The fields that mean something, as one word each; anything else is skipped.
@@ -148,12 +160,13 @@ enum Key {
 }
 
 /// Every field of every message.
-const KEYS: [&str; 15] = [
+const KEYS: [&str; 17] = [
     "type",
     "t",
     "landmarks",
     "confidence",
     "weights",
+    "expressions",
     "head",
     "bones",
     "face",
@@ -164,6 +177,7 @@ const KEYS: [&str; 15] = [
     "image",
     "focal",
     "takeover",
+    "keep_neutral",
 ];
 
 impl<'de> serde::Deserialize<'de> for Key {
@@ -190,7 +204,7 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
-        let Self { fields, bones } = self;
+        let Self { fields, names } = self;
         while let Some(key) = map.next_key::<Key>()? {
             let Key::Known(key) = key else {
                 map.next_value::<IgnoredAny>()?;
@@ -214,7 +228,8 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
                 "confidence" => map.next_value_seed(Confidence(fields))?,
                 "weights" => map.next_value_seed(Weights(fields))?,
                 "head" => map.next_value_seed(Head(fields))?,
-                "bones" => map.next_value_seed(Bones(fields, bones))?,
+                "expressions" => map.next_value_seed(Expressions(fields, names.map(|names| names.expressions.as_slice())))?,
+                "bones" => map.next_value_seed(Bones(fields, names.map(|names| &names.bones)))?,
                 "face" => fields.face = Some(map.next_value_seed(Flag)?),
                 "version" => fields.version = Some(map.next_value_seed(Number("the protocol's version, 1"))?),
                 "source" => fields.source = Some(map.next_value_seed(Text("the sender's name"))?.chars().take(MAX_SOURCE).collect()),
@@ -228,7 +243,8 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
                     fields.image = Some(size);
                 }
                 "focal" => fields.focal = Some(map.next_value_seed(Number("pixels"))?),
-                _ => fields.takeover = map.next_value_seed(Flag)?,
+                "takeover" => fields.takeover = map.next_value_seed(Flag)?,
+                _ => fields.keep_neutral = map.next_value_seed(Flag)?,
             }
             fields.reading = "";
         }
@@ -489,6 +505,65 @@ impl<'de> Visitor<'de> for Weights<'_> {
             fields.refuse("unknown_shape", || {
                 format!("field weights has {num_unknown} names and none is an ARKit shape, expected jawOpen, browInnerUp, …")
             });
+        }
+        Ok(())
+    }
+}
+
+struct Expressions<'a>(&'a mut Fields, Option<&'a [String]>);
+
+impl<'de> DeserializeSeed<'de> for Expressions<'_> {
+    type Value = ();
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_map(self)
+    }
+}
+
+/// An expression by name, or the name where the character has no such expression.
+struct ExpressionKey<'a>(&'a [String]);
+
+impl<'de> DeserializeSeed<'de> for ExpressionKey<'_> {
+    type Value = Result<usize, String>;
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
+        deserializer.deserialize_str(self)
+    }
+}
+
+impl Visitor<'_> for ExpressionKey<'_> {
+    type Value = Result<usize, String>;
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("the name of an expression")
+    }
+    fn visit_str<E: Error>(self, name: &str) -> Result<Self::Value, E> {
+        Ok(self.0.iter().position(|known| known == name).ok_or_else(|| cut(name)))
+    }
+}
+
+impl<'de> Visitor<'de> for Expressions<'_> {
+    type Value = ();
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("an object of amounts by the character's names of expressions")
+    }
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+        let Self(fields, names) = self;
+        fields.has_expressions = true;
+        fields.expressions.fill(0.0);
+        let known = names.unwrap_or_default();
+        while let Some(expression) = map.next_key_seed(ExpressionKey(known))? {
+            let value = map.next_value_seed(Number("an amount, 0 to 1.2"))?;
+            let name = || expression.as_ref().map_or_else(String::as_str, |&index| known[index].as_str());
+            // False for NaN, too.
+            if !(0.0..=MAX_AMOUNT).contains(&value) {
+                fields.refuse("out_of_range", || format!("field expressions.{} is {value}, expected 0 to {MAX_AMOUNT}", name()));
+            }
+            match &expression {
+                // A checked character has no more than fit.
+                Ok(index) => fields.expressions[*index] = value as f32,
+                Err(_) if known.is_empty() => {}
+                Err(name) => fields.refuse("unknown_expression", || {
+                    format!("field expressions.{name} is no expression of this character, expected {}", known.join(", "))
+                }),
+            }
         }
         Ok(())
     }

@@ -5,12 +5,12 @@ use super::{MessageError, PublishHello, PublishMessage, TrackingData, TrackingFr
 use crate::character::Character;
 use crate::face::HeadPose;
 use crate::layout::Layout;
-use crate::limits::{MAX_FEATURE_POINTS, MAX_SECONDS};
+use crate::limits::{FOCAL_RANGE, MAX_FEATURE_POINTS, MAX_SECONDS};
 use crate::names::NUM_ARKIT_SHAPES;
 use crate::view::PROTOCOL_VERSION;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Largest side of a tracker's picture and largest focal length, pixels.
+/// Largest side of a tracker's picture, pixels.
 const MAX_IMAGE: f64 = 1e5;
 /// Most frames a second a hello may claim: faster than any face camera.
 const MAX_FPS: f64 = 1000.0;
@@ -29,9 +29,11 @@ pub struct PublishReader {
 
 /// What a character calls its parts.
 #[derive(Debug, Clone)]
-struct Names {
-    bones: BTreeMap<String, usize>,
+pub(super) struct Names {
+    pub(super) bones: BTreeMap<String, usize>,
     features: BTreeSet<String>,
+    /// In the order of its table; empty for a character without wrinkle zones.
+    pub(super) expressions: Vec<String>,
 }
 
 impl PublishReader {
@@ -40,19 +42,20 @@ impl PublishReader {
         let names = Names {
             bones: character.bones.iter().enumerate().map(|(i, bone)| (bone.name.clone(), i)).collect(),
             features: character.features.keys().cloned().collect(),
+            expressions: character.zones.iter().flat_map(|zones| &zones.expressions).map(|row| row.name.clone()).collect(),
         };
         Self { names: Some(names), fields: Fields::new(), hello: None, last_t: None, t_before: None }
     }
 
-    /// A reader for a sender, which does not know the character at the other end: names of bones and of feature points are
-    /// not checked, and the bones of a frame are left out.
+    /// A reader for a sender, which does not know the character at the other end: names of bones, of
+    /// feature points and of expressions are not checked, and the bones and expressions of a frame are left out.
     pub fn for_any_character() -> Self {
         Self { names: None, fields: Fields::new(), hello: None, last_t: None, t_before: None }
     }
 
     /// Reads one message. A frame is written into `frame`, whose buffers are reused; after an error `frame` is as it was.
     pub fn read(&mut self, text: &str, frame: &mut TrackingFrame) -> Result<PublishMessage, MessageError> {
-        self.fields.read(text, self.names.as_ref().map(|names| &names.bones))?;
+        self.fields.read(text, self.names.as_ref())?;
         if let Some(problem) = self.fields.problem.take() {
             return Err(problem);
         }
@@ -109,8 +112,9 @@ impl PublishReader {
             fps: fields.fps.map(|fps| within("fps", fps, MAX_FPS, "frames a second")).transpose()?,
             layout,
             image,
-            focal: fields.focal.map(|focal| within("focal", focal, MAX_IMAGE, "pixels")).transpose()?,
+            focal: fields.focal.map(|focal| check_focal(focal, image)).transpose()?,
             takeover: fields.takeover,
+            keep_neutral: fields.keep_neutral,
         })
     }
 
@@ -148,7 +152,19 @@ impl PublishReader {
                     *slot = head;
                 }
             }
-            (false, false, false) => return Err(missing("landmarks", "landmarks, weights, bones or \"face\":false in a frame")),
+            (false, false, false) if fields.has_expressions => {
+                if self.names.as_ref().is_some_and(|names| names.expressions.is_empty()) {
+                    return Err(MessageError::new(
+                        "no_expressions",
+                        "frame has only the field expressions, and this character has none, expected landmarks, weights or bones",
+                    ));
+                }
+                // A face at rest, to wrinkle by expressions alone.
+                frame.data = TrackingData::Bones { points: Vec::new(), head };
+            }
+            (false, false, false) => {
+                return Err(missing("landmarks", "landmarks, weights, bones, expressions or \"face\":false in a frame"));
+            }
             _ => {
                 return Err(MessageError::new(
                     "ambiguous_frame",
@@ -156,6 +172,9 @@ impl PublishReader {
                 ));
             }
         }
+        // A character without a table has no use for them; what came with them still counts.
+        let has_table = self.names.as_ref().is_some_and(|names| !names.expressions.is_empty());
+        frame.expressions = (has_table && fields.has_expressions && fields.face != Some(false)).then_some(fields.expressions);
         frame.t = t;
         self.t_before = self.last_t.replace(t);
         Ok(())
@@ -164,6 +183,19 @@ impl PublishReader {
 
 fn missing(field: &str, expected: &str) -> MessageError {
     MessageError::new("missing_field", format!("field {field} is missing, expected {expected}"))
+}
+
+/// A focal length in pixels that a lens can have before a picture of this size.
+fn check_focal(focal: f64, image: Option<[f32; 2]>) -> Result<f32, MessageError> {
+    let [least, most] = FOCAL_RANGE;
+    let (narrowest, widest) = image.map_or((0.0, MAX_IMAGE as f32), |[width, _]| (width, width));
+    let (shortest, longest) = (least * narrowest, most * widest);
+    let pixels = focal as f32;
+    if pixels > 0.0 && (shortest..=longest).contains(&pixels) {
+        return Ok(pixels);
+    }
+    let of = image.map_or(String::new(), |[width, _]| format!(", {least} to {most} times the picture's width of {width}"));
+    Err(MessageError::new("out_of_range", format!("field focal is {focal}, expected {shortest} to {longest} pixels{of}")))
 }
 
 fn check_layout(layout: LayoutField, features: Option<&BTreeSet<String>>) -> Result<Layout, MessageError> {
@@ -324,7 +356,7 @@ mod tests {
                 "field t: invalid type: string \"2\", expected a number (seconds",
             ),
             (r#"{"type":"frame","landmarks":[[1,2],[3,4]]}"#, "missing_field", "field t is missing"),
-            (r#"{"type":"frame","t":2}"#, "missing_field", "landmarks, weights, bones or \"face\":false"),
+            (r#"{"type":"frame","t":2}"#, "missing_field", "landmarks, weights, bones, expressions or \"face\":false"),
             (r#"{"t":2,"face":false}"#, "missing_field", "field type"),
             (r#"{"type":"settings","t":2}"#, "unknown_type", "\"settings\""),
             (r#"{"type":"frame","t":1,"face":false}"#, "time_order", "field t is 1, expected more than the 1"),
@@ -363,6 +395,65 @@ mod tests {
     }
 
     #[test]
+    fn expressions_come_with_anything_or_alone() {
+        let mut character = tiny_character();
+        character.zones = Some(crate::testing::one_zone(&["joy", "surprise"]));
+        let mut reader = PublishReader::new(&character);
+        let mut frame = TrackingFrame::default();
+        reader.read(HELLO, &mut frame).unwrap();
+        let mut given = |text: &str| {
+            assert_eq!(reader.read(text, &mut frame), Ok(PublishMessage::Frame), "{text}");
+            (frame.data.clone(), frame.expressions.map(|amounts| [amounts[0], amounts[1], amounts[2]]))
+        };
+        let (data, expressions) = given(r#"{"type":"frame","t":1,"landmarks":[[1,2],[3,4]],"expressions":{"surprise":0.8}}"#);
+        assert!(matches!(data, TrackingData::Landmarks { .. }));
+        assert_eq!(expressions, Some([0.0, 0.8, 0.0]));
+        let (data, expressions) = given(r#"{"type":"frame","t":2,"expressions":{"joy":1.2,"surprise":0},"weights":{"jawOpen":1}}"#);
+        assert!(matches!(data, TrackingData::Weights { .. }));
+        assert_eq!(expressions, Some([1.2, 0.0, 0.0]));
+        // Alone: the face at rest. An empty list is a face without any expression, not one that says nothing of them.
+        assert_eq!(
+            given(r#"{"type":"frame","t":3,"expressions":{}}"#),
+            (TrackingData::Bones { points: vec![], head: None }, Some([0.0; 3]))
+        );
+        let (_, expressions) = given(r#"{"type":"frame","t":4,"bones":{},"head":{"rotation":[0,0,0,1]}}"#);
+        assert_eq!(expressions, None, "what a frame does not say is not what the one before said");
+        assert_eq!(given(r#"{"type":"frame","t":5,"expressions":{"joy":1},"face":false}"#), (TrackingData::NoFace, None));
+
+        let before = frame.clone();
+        for (text, code, says) in [
+            (
+                r#"{"type":"frame","t":6,"expressions":{"suprise":1}}"#,
+                "unknown_expression",
+                "field expressions.suprise is no expression of this character, expected joy, surprise",
+            ),
+            (r#"{"type":"frame","t":6,"expressions":{"joy":1.21}}"#, "out_of_range", "field expressions.joy is 1.21, expected 0 to 1.2"),
+            (r#"{"type":"frame","t":6,"expressions":{"joy":-0.1}}"#, "out_of_range", "field expressions.joy is -0.1"),
+            (r#"{"type":"frame","t":6,"expressions":{"joy":null}}"#, "wrong_type", "field expressions"),
+            (r#"{"type":"frame","t":6,"expressions":[1]}"#, "wrong_type", "field expressions: invalid type: sequence"),
+            (r#"{"type":"frame","t":6,"expressions":{"joy":NaN}}"#, "malformed_json", "in field expressions"),
+        ] {
+            let error = reader.read(text, &mut frame).expect_err(text);
+            assert_eq!(error.code, code, "{text}: {error}");
+            assert!(error.message.contains(says), "{text}: {error}");
+            assert_eq!(frame, before, "{text}");
+        }
+    }
+
+    #[test]
+    fn expressions_for_a_character_without_any() {
+        let (mut reader, mut frame) = after_hello();
+        reader.read(r#"{"type":"frame","t":1,"landmarks":[[1,2],[3,4]],"expressions":{"joy":1}}"#, &mut frame).unwrap();
+        assert_eq!(frame.expressions, None);
+        let error = reader.read(r#"{"type":"frame","t":2,"expressions":{"joy":1}}"#, &mut frame).unwrap_err();
+        assert_eq!(error.code, "no_expressions");
+        // A sender does not know the character at the other end.
+        let mut reader = PublishReader::for_any_character();
+        reader.read(HELLO, &mut frame).unwrap();
+        reader.read(r#"{"type":"frame","t":1,"expressions":{"awe":1}}"#, &mut frame).unwrap();
+    }
+
+    #[test]
     fn a_frame_taken_back_leaves_the_clock_as_it_was() {
         let (mut reader, mut frame) = after_hello();
         let mut read = |reader: &mut PublishReader, t: f64| reader.read(&format!(r#"{{"type":"frame","t":{t},"face":false}}"#), &mut frame);
@@ -394,13 +485,21 @@ mod tests {
             (r#"{"type":"hello","version":1,"layout":"ibug68"}"#, "missing_field", "field image"),
             (r#"{"type":"hello","version":1,"layout":"ibug68","image":[0,5]}"#, "out_of_range", "image[0]"),
             (r#"{"type":"hello","version":1,"layout":"ibug68","image":[5,5,5]}"#, "wrong_count", "image has 3 numbers"),
-            (r#"{"type":"hello","version":1,"focal":-1}"#, "out_of_range", "focal"),
+            (r#"{"type":"hello","version":1,"focal":-1}"#, "out_of_range", "focal is -1, expected 0 to 5000000 pixels"),
+            (
+                r#"{"type":"hello","version":1,"layout":"ibug68","focal":39.9,"image":[400,300]}"#,
+                "out_of_range",
+                "focal is 39.9, expected 40 to 20000 pixels, 0.1 to 50 times the picture's width of 400",
+            ),
+            (r#"{"type":"hello","version":1,"image":[400,300],"focal":20001}"#, "out_of_range", "focal is 20001, expected 40 to 20000"),
+            (r#"{"type":"hello","version":1,"image":[400,300],"focal":1e300}"#, "out_of_range", "expected 40 to 20000"),
             (r#"{"type":"hello","version":1,"fps":0}"#, "out_of_range", "fps"),
             (
                 r#"{"type":"hello","version":1,"takeover":"yes"}"#,
                 "wrong_type",
                 "field takeover: invalid type: string \"yes\", expected true or false",
             ),
+            (r#"{"type":"hello","version":1,"keep_neutral":1}"#, "wrong_type", "field keep_neutral"),
         ] {
             let (mut reader, mut frame) = reader();
             let error = reader.read(text, &mut frame).expect_err(text);
@@ -414,6 +513,16 @@ mod tests {
             panic!("refused")
         };
         assert_eq!((hello.source.chars().count(), hello.layout, hello.takeover), (128, None, false));
+    }
+
+    #[test]
+    fn focal_lengths_that_lenses_have_are_taken() {
+        for (focal, image) in [(40.0, "400,300"), (20_000.0, "400,300"), (0.1, "1,1"), (4e6, "1e5,1")] {
+            let (mut reader, mut frame) = reader();
+            let text = format!(r#"{{"type":"hello","version":1,"focal":{focal},"image":[{image}],"keep_neutral":true}}"#);
+            let Ok(PublishMessage::Hello(hello)) = reader.read(&text, &mut frame) else { panic!("{text} is refused") };
+            assert_eq!((hello.focal, hello.keep_neutral), (Some(focal as f32), true));
+        }
     }
 
     #[test]

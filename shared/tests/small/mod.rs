@@ -79,6 +79,37 @@ impl Glb {
         Self { json, bin: bin.bytes }
     }
 
+    /// Two zones, one on each half, with a mask of 4 x 4 texels and a map of as many; `up` at `brow_l` drives the left one.
+    #[allow(dead_code, reason = "not every test binary looks at zones")]
+    pub fn with_zones(mut self) -> Self {
+        let mask = self.texture(&png_of(image::RgbaImage::from_pixel(4, 4, image::Rgba([100, 155, 255, 255]))));
+        let map = self.texture(&png(4, 4));
+        self.json["extensions"]["RHYTID_face"]["zones"] = json!({
+            "list": [{"name": "red", "side": "left"}, {"name": "green", "side": "right"}],
+            "masks": [mask],
+            "map": {"texture": map, "scale": 0.5},
+            "expressions": [{"name": "surprise", "weights": [0.8, 0.8]}, {"name": "anger", "weights": [-0.6, -0.6]}],
+            "bridge": [{"pose": "up", "bone": "brow_l", "zone": "red", "gain": 0.5}],
+        });
+        self
+    }
+
+    /// Adds an image; gives the index of its texture.
+    #[allow(dead_code, reason = "not every test binary adds images")]
+    pub fn texture(&mut self, png: &[u8]) -> usize {
+        let push = |list: &mut Value, value: Value| {
+            let list = list.as_array_mut().unwrap();
+            list.push(value);
+            list.len() - 1
+        };
+        let view = push(&mut self.json["bufferViews"], json!({"buffer": 0, "byteOffset": self.bin.len(), "byteLength": png.len()}));
+        self.bin.extend(png);
+        self.bin.resize(self.bin.len().next_multiple_of(4), 0);
+        self.json["buffers"][0]["byteLength"] = json!(self.bin.len());
+        let image = push(&mut self.json["images"], json!({"bufferView": view, "mimeType": "image/png"}));
+        push(&mut self.json["textures"], json!({"source": image}))
+    }
+
     pub fn to_bytes(&self) -> Vec<u8> {
         self.with_json(&serde_json::to_vec(&self.json).unwrap())
     }
@@ -103,8 +134,13 @@ impl Glb {
 
 /// A white PNG.
 pub fn png(width: u32, height: u32) -> Vec<u8> {
+    png_of(image::GrayImage::from_pixel(width, height, image::Luma([255])))
+}
+
+/// A picture as PNG.
+pub fn png_of(picture: impl Into<image::DynamicImage>) -> Vec<u8> {
     let mut bytes = std::io::Cursor::new(Vec::new());
-    image::GrayImage::from_pixel(width, height, image::Luma([255])).write_to(&mut bytes, image::ImageFormat::Png).unwrap();
+    picture.into().write_to(&mut bytes, image::ImageFormat::Png).unwrap();
     bytes.into_inner()
 }
 

@@ -197,7 +197,7 @@ fn session_frame(character: &Arc<Character>, solve: Solve, index: usize) -> anyh
         }
     }
     let mut pipeline = Pipeline::new(Arc::clone(character), &config, &feed.hello, 1)?;
-    let mut frame = TrackingFrame { t: 0.0, data: TrackingData::NoFace };
+    let mut frame = TrackingFrame::new(0.0, TrackingData::NoFace);
     let (mut packet, mut num_frames) = (Vec::new(), 0);
     while let Some(item) = feed.next_frame(&mut frame)? {
         ensure!(item == FeedItem::Frame, "the built-in session holds frames only");

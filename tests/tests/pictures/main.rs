@@ -8,7 +8,9 @@ mod morphs;
 mod probe;
 mod properties;
 mod read_back;
+mod skin;
 mod twins;
+mod zones;
 
 use libtest_mimic::{Arguments, Trial};
 use rhytid_client::renderer::AdapterChoice;
@@ -65,6 +67,8 @@ fn main() -> ExitCode {
     };
     twins::add(&mut add);
     morphs::add(&mut add);
+    skin::add(&mut add);
+    zones::add(&mut add);
     properties::add(&mut add);
     golden::add(&mut add);
     libtest_mimic::run(&arguments, trials).exit_code()

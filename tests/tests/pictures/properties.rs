@@ -206,7 +206,7 @@ fn targets_encode_alike(stage: &Stage) -> anyhow::Result<()> {
             });
             let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("test picture") });
             let seen = target.create_view(&wgpu::TextureViewDescriptor::default());
-            renderer.draw(device, queue, &mut encoder, &seen, [SIDE, SIDE], &settings, &frame);
+            renderer.draw(device, queue, &mut encoder, &seen, [SIDE, SIDE], &settings, &frame, None);
             read_back(device, queue, encoder, &target)
         };
         let (encoding, plain) = (draw(wgpu::TextureFormat::Rgba8UnormSrgb)?, draw(wgpu::TextureFormat::Rgba8Unorm)?);

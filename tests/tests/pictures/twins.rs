@@ -202,6 +202,7 @@ fn influences(stage: &Stage) -> anyhow::Result<()> {
             palette: stage.asset.palette.clone(),
             morphs: Morphs::default(),
             wrinkles: None,
+            zones: None,
         };
         let halves = (0..num_poses.div_ceil(4) as u32)
             .map(|half| probe_skinning(stage, &asset, &frame, &vertices, 3 + half))
@@ -344,6 +345,11 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
                     (2, Resource::Block(bytemuck::bytes_of(&table))),
                     (3, Resource::Texture { view: &layers_view, dimension: D2Array, is_filterable: true }),
                     (4, Resource::Sampler),
+                    // Zones are left out, but the shader names what they read.
+                    (7, Resource::Texture { view: &layers_view, dimension: D2Array, is_filterable: true }),
+                    (8, Resource::Texture { view: &layers_view, dimension: D2Array, is_filterable: true }),
+                    (9, Resource::Texture { view: &base_view, dimension: D2, is_filterable: true }),
+                    (10, Resource::Block(&[0; size_of::<uniforms::ZoneWeights>()])),
                 ],
             ),
             (

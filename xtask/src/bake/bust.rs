@@ -80,6 +80,18 @@ pub struct SlopeMap {
     pub scale: f32,
 }
 
+/// Masks and maps of the wrinkle zones.
+pub struct PaintedZones {
+    /// RGBA, linear: four zones each.
+    pub masks: [Encoded; 2],
+    /// The wrinkles of all zones.
+    pub map: SlopeMap,
+    /// What takes the resting face's creases out.
+    pub stretch: SlopeMap,
+    /// The wrinkles as differences of unit normals from the flat one, `(code - 128) / 127` in red, green and blue.
+    pub difference: Encoded,
+}
+
 /// What the painter gives back.
 pub struct Painted {
     /// Skin colour, sRGB.
@@ -90,6 +102,8 @@ pub struct Painted {
     pub skin_surface: Encoded,
     /// One for each of [`Bust::poses`], all of one size, a power of two a side.
     pub wrinkles: Vec<SlopeMap>,
+    /// Wrinkle zones.
+    pub zones: PaintedZones,
     /// Eyeball, sRGB: front pole in the middle, distance from it proportional to the angle from the front pole, the
     /// circle that touches the border being `eyes::TEXTURE_ANGLE`.
     pub eye_albedo: Encoded,

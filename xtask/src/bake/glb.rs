@@ -3,9 +3,10 @@
 use super::bust::{Encoded, Painted};
 use super::part::{Material, Part};
 use super::rig::Rig;
+use super::zones;
 use glam::Vec3;
 use rhytid_shared::ARKIT_NAMES;
-use rhytid_shared::character::schema::{EXTENSION, Face};
+use rhytid_shared::character::schema::{EXTENSION, Face, ZoneMap};
 use serde_json::{Value, json};
 
 const FLOAT: u32 = 5126;
@@ -20,7 +21,7 @@ pub struct Contents<'a> {
     pub parts: &'a [Part],
     /// Joints.
     pub rig: &'a Rig,
-    /// The extension; its maps' texture indices are set here.
+    /// The extension; its maps' texture indices and its zones are set here.
     pub face: Face,
     /// Textures.
     pub painted: &'a Painted,
@@ -124,6 +125,12 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
         let texture = writer.texture(&map.image, &format!("wrinkles_{}", pose.name));
         pose.map = Some(rhytid_shared::character::schema::WrinkleMap { texture, scale: map.scale, contains_neutral: false });
     }
+    let [first, second] = &painted.zones.masks;
+    let masks = [writer.texture(first, "zone_mask_0"), writer.texture(second, "zone_mask_1")];
+    let [map, stretch] = [(&painted.zones.map, "zone_wrinkles"), (&painted.zones.stretch, "zone_stretch")]
+        .map(|(map, name)| ZoneMap { texture: writer.texture(&map.image, name), scale: map.scale });
+    let difference = writer.texture(&painted.zones.difference, "zone_difference");
+    face.zones = Some(zones::describe(masks, map, stretch, difference));
 
     // Joints come first, so that joint and node indices are the same; the mesh's node is the last.
     let mut nodes: Vec<Value> = rig

@@ -18,6 +18,7 @@ mod skin;
 mod slopes;
 mod teeth;
 mod wrinkles;
+mod zones;
 
 use super::bust::{Bust, Painted};
 use anyhow::Result;
@@ -38,6 +39,7 @@ pub fn paint(bust: &Bust) -> Result<Painted> {
     let coarse = Atlas::new(bust, COARSE);
     let openness = Openness::new(bust, &coarse);
     let wrinkles = bust.poses.iter().map(|pose| wrinkles::paint(&chart, &coarse, pose)).collect::<Result<_>>()?;
+    let zones = zones::paint(&chart, &coarse)?;
     let skin_surface = occlusion::paint(&coarse, &features, &openness)?;
 
     let fine = Atlas::new(bust, FINE);
@@ -47,6 +49,7 @@ pub fn paint(bust: &Bust) -> Result<Painted> {
         skin_slopes: pores::paint(&fine, &features, &hairs, &wrinkles::permanent(&chart))?,
         skin_surface,
         wrinkles,
+        zones,
         eye_albedo: eyes::paint(bust)?,
         teeth_albedo: teeth::paint()?,
     })

@@ -2,7 +2,7 @@
 
 use super::super::bust::Encoded;
 use anyhow::Result;
-use image::ExtendedColorType::Rgb8;
+use image::ExtendedColorType::{Rgb8, Rgba8};
 use image::ImageEncoder;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
@@ -19,6 +19,14 @@ pub fn png(size: usize, rgb: &[u8]) -> Result<Encoded> {
     let mut bytes = Vec::new();
     let encoder = PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive);
     encoder.write_image(rgb, size as u32, size as u32, Rgb8)?;
+    Ok(Encoded { mime: "image/png", bytes })
+}
+
+/// A PNG of `size`² RGBA texels.
+pub fn png_rgba(size: usize, rgba: &[u8]) -> Result<Encoded> {
+    let mut bytes = Vec::new();
+    let encoder = PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive);
+    encoder.write_image(rgba, size as u32, size as u32, Rgba8)?;
     Ok(Encoded { mime: "image/png", bytes })
 }
 
