@@ -6,12 +6,15 @@ mod gradients;
 mod joints;
 mod load;
 mod mips;
+mod morphs;
 
 pub use blood::{BloodChange, BloodMaps, BloodTexel};
 pub use gradients::{triangle_gradient, weight_gradients};
 pub use joints::{JointMotion, Palette};
 pub use mips::{MipChain, Texels};
+pub use morphs::{ENTRIES_PER_ROW, MAX_ENTRIES, MorphEntry, Morphs, TEXELS_PER_ENTRY};
 
+use glam::Vec3;
 use rhytid_shared::{Character, CharacterError};
 use std::sync::Arc;
 
@@ -29,6 +32,24 @@ pub enum AssetError {
         /// What the decoder said.
         source: image::ImageError,
     },
+    /// A morph target moves a vertex to nowhere.
+    #[error("character file part {part:?}: target {shape} moves vertex {vertex} by {got}, expected finite metres within ±10")]
+    Delta {
+        /// Name of the part's material.
+        part: String,
+        /// ARKit's name of the target.
+        shape: &'static str,
+        /// Index of the vertex.
+        vertex: usize,
+        /// The displacement.
+        got: Vec3,
+    },
+    /// The targets do not fit into one texture.
+    #[error("the morph targets move vertices in more than {most} places, counted once for each vertex and shape")]
+    TooManyDeltas {
+        /// How many fit.
+        most: usize,
+    },
 }
 
 /// A character ready to be uploaded.
@@ -40,6 +61,8 @@ pub struct CharacterAsset {
     pub primitives: Vec<PrimitiveAsset>,
     /// How each joint of the palette moves; entry `i` below the number of bones is bone `i`'s joint.
     pub palette: Palette,
+    /// What expression shapes do to the vertices.
+    pub morphs: Morphs,
     /// The wrinkle maps, if any pose has one.
     pub wrinkles: Option<WrinkleMaps>,
     /// Maps of the wrinkle zones, where the character has them.
@@ -167,6 +190,8 @@ pub struct Vertex {
     /// Gradients of weights 1, 2 and 3 in the tangent plane, 1/metre, each along the tangent and along
     /// `cross(normal, tangent)`. Weight 0's gradient is minus their sum.
     pub gradients: [[f32; 2]; 3],
+    /// First of its entries in [`Morphs`], and how many it has.
+    pub morphs: [u32; 2],
 }
 
 /// Colours and maps of a part.

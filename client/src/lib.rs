@@ -19,5 +19,5 @@ pub mod view;
 pub use asset::{AssetError, CharacterAsset};
 pub use link::{Link, LinkOptions, LinkState, LinkStats, ServerAddress};
 pub use playout::{Playout, PlayoutState, PlayoutStats};
-pub use renderer::{BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, Renderer, ViewMode};
+pub use renderer::{BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, Renderer, ViewMode};
 pub use spectator::{Spectator, Status, StatusKind};

@@ -3,7 +3,7 @@
 use crate::asset::{AssetError, CharacterAsset};
 use crate::picture_size::parse_size;
 use crate::renderer::{
-    BlendMode, Camera, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode, WrinkleSystem, ZoneBlend,
+    BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode, WrinkleSystem, ZoneBlend,
 };
 use glam::{Quat, Vec3};
 use image::RgbaImage;
@@ -118,6 +118,9 @@ pub struct PictureArgs {
     /// How wrinkle maps become normals: pd, simple or printed
     #[arg(long, default_value_t = BlendMode::PartialDerivatives)]
     pub blend: BlendMode,
+    /// What deforms the face: bones, or the mesh's own expression shapes where the frame has weights for them
+    #[arg(long, default_value_t = Deformation::Bones, value_name = "bones|shapes")]
+    pub deform: Deformation,
     /// Character file; the built-in one where none is given
     #[arg(long, value_name = "FILE.glb")]
     pub character: Option<PathBuf>,
@@ -225,6 +228,7 @@ impl PictureMaker {
         let view = ViewMode::parse(&args.view, &asset.character)?;
         let settings = DrawSettings {
             view,
+            deform: args.deform,
             blend: args.blend,
             system: args.wrinkles,
             zone_blend: args.zone_blend,

@@ -5,6 +5,7 @@ mod background;
 mod blood;
 mod camera;
 mod coefficients;
+mod deformation;
 mod environment;
 mod frame;
 mod fullscreen;
@@ -27,6 +28,7 @@ mod zones;
 
 pub use camera::Camera;
 pub use coefficients::{bone_major, moves_bone, pose_table};
+pub use deformation::{Deformation, DeformationError};
 pub use frame::RenderFrame;
 pub use headless::{AdapterChoice, Headless, RenderError, optional_features, required_limits};
 pub use pipelines::VERTEX_LAYOUT;
@@ -58,6 +60,8 @@ pub struct DrawSettings {
     pub camera: Camera,
     /// What.
     pub view: ViewMode,
+    /// What deforms the face.
+    pub deform: Deformation,
     /// How wrinkle maps become normals.
     pub blend: BlendMode,
     /// Off: every influence counts as 0, but the pipeline with the wrinkle code draws.
@@ -107,6 +111,7 @@ impl DrawSettings {
         Self {
             camera,
             view: ViewMode::Beauty,
+            deform: Deformation::Bones,
             blend: BlendMode::PartialDerivatives,
             wrinkles: true,
             system: WrinkleSystem::default(),
@@ -126,6 +131,7 @@ impl DrawSettings {
 pub struct Renderer {
     character: Arc<Character>,
     palette: Palette,
+    has_shapes: bool,
     bounds: Bounds,
     primitives: Vec<Primitive>,
     group: CharacterGroup,
@@ -200,6 +206,7 @@ impl Renderer {
         Self {
             character: Arc::clone(&asset.character),
             palette: asset.palette.clone(),
+            has_shapes: !asset.morphs.is_empty(),
             bounds: Bounds::new(asset),
             group,
             zone_scales: asset.zones.as_ref().map(ZoneScales::new),
@@ -303,7 +310,13 @@ impl Renderer {
             at_rest = RenderFrame::at_rest(character);
             &at_rest
         };
-        let rows: Vec<[[f32; 4]; 3]> = self.palette.model_from_rest(character, frame).iter().map(uniforms::rows_of).collect();
+        let weights = settings.deform.weights_of(frame).filter(|_| self.has_shapes);
+        let matrices = match weights {
+            Some(_) => self.palette.model_from_unposed(character, frame),
+            None => self.palette.model_from_rest(character, frame),
+        };
+        let rows: Vec<[[f32; 4]; 3]> = matrices.iter().map(uniforms::rows_of).collect();
+        queue.write_buffer(&self.group.morph_weights, 0, bytemuck::bytes_of(&uniforms::MorphWeights::new(weights)));
         queue.write_buffer(&self.group.palette, 0, bytemuck::cast_slice(&rows));
 
         let (num_bones, num_poses) = (character.num_bones(), character.num_poses());

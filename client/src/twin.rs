@@ -1,9 +1,12 @@
-//! CPU twins of what the GPU computes: skinning with turning normals, vertex influences, slopes of maps, each wrinkle
+//! CPU twins of what the GPU computes: shapes, skinning with turning normals, vertex influences, slopes of maps, each wrinkle
 //! blend, the tone curve. The tests hold these to published and derived numbers, and the GPU to these.
 
 pub mod blood;
+mod morph;
 pub mod skin;
 pub mod zones;
+
+pub use morph::{Morphed, morph};
 
 use crate::asset::Vertex;
 use crate::renderer::{BlendMode, moves_bone};
@@ -24,19 +27,21 @@ pub struct Deformed {
 /// Twin of `deform` in `skinning.wgsl`. Linear-blend skinning; with `F = Σ w_i A_i + Σ (M_i v)(∇w_i)ᵀ` the normal is
 /// `cof(F) n = F t × F b` for an orthonormal `t`, `b`, `n = t × b`.
 pub fn deform(vertex: &Vertex, palette: &[Affine3A]) -> Deformed {
+    deform_morphed(vertex, &Morphed::neutral(vertex), palette)
+}
+
+/// As [`deform`], after the shapes: by the chain rule `F` takes the morphed position, tangent and bitangent, and the
+/// weights' gradients as they are.
+pub fn deform_morphed(vertex: &Vertex, morphed: &Morphed, palette: &[Affine3A]) -> Deformed {
     let matrices = vertex.joints.map(|joint| palette[usize::from(joint)]);
-    let rest = Vec3::from(vertex.position);
-    let [x, y, z, _] = vertex.tangent;
-    let tangent = Vec3::new(x, y, z);
-    let bitangent = Vec3::from(vertex.normal).cross(tangent);
-    let moved = matrices.map(|matrix| matrix.transform_point3(rest));
+    let moved = matrices.map(|matrix| matrix.transform_point3(morphed.position));
     let weighted = |values: [Vec3; 4]| (0..4).map(|slot| values[slot] * vertex.weights[slot]).sum::<Vec3>();
     let along = |direction: Vec3, component: usize| {
         let rigid = weighted(matrices.map(|matrix| matrix.transform_vector3(direction)));
         rigid + (1..4).map(|slot| (moved[slot] - moved[0]) * vertex.gradients[slot - 1][component]).sum::<Vec3>()
     };
-    let f_tangent = along(tangent, 0);
-    let normal = f_tangent.cross(along(bitangent, 1)).normalize_or_zero();
+    let f_tangent = along(morphed.tangent, 0);
+    let normal = f_tangent.cross(along(morphed.bitangent, 1)).normalize_or_zero();
     Deformed { position: weighted(moved), normal, tangent: (f_tangent - normal * f_tangent.dot(normal)).normalize_or_zero() }
 }
 
@@ -127,6 +132,7 @@ mod tests {
             joints: [0, 1, 2, 3],
             weights,
             gradients: gradients.map(|gradient| [gradient.dot(tangent), gradient.dot(bitangent)]),
+            morphs: [0; 2],
         }
     }
 
@@ -211,7 +217,7 @@ mod tests {
     }
 
     /// Sum of the area vectors of the triangles round each vertex; vertices at the same place at rest share theirs.
-    fn area_normals(rest: &[Vertex], positions: &[Vec3], indices: &[u32]) -> Vec<Vec3> {
+    pub(in crate::twin) fn area_normals(rest: &[Vertex], positions: &[Vec3], indices: &[u32]) -> Vec<Vec3> {
         let place = |vertex: u32| rest[vertex as usize].position.map(f32::to_bits);
         let mut sums: HashMap<[u32; 3], Vec3> = HashMap::new();
         for triangle in indices.as_chunks::<3>().0 {

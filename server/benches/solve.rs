@@ -9,7 +9,7 @@ mod solve_fixture;
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use glam::{DVec2, DVec3, Vec3};
 use rhytid_server::pipeline::Pipeline;
-use rhytid_server::solve::stages::{Evaluator, OneEuroBank, Pose, Regression, lift, refine};
+use rhytid_server::solve::stages::{Evaluator, ExpressionMap, OneEuroBank, Pose, Regression, lift, refine};
 use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::layout::{IBUG_FROM_MEDIAPIPE, IBUG_STABLE, Layout};
 use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame, TrackingData, TrackingFrame};
@@ -49,6 +49,15 @@ fn whole(criterion: &mut Criterion) {
         solver.solve(frames.next(), &mut out).expect("a good frame");
     }
     criterion.bench_function("whole frame", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
+
+    let without = SolveConfig { estimate_weights: false, ..SolveConfig::default() };
+    let mut solver = Solver::new(character.clone(), &without, &hello(Some(Layout::Ibug68), None)).expect("a good session");
+    for _ in 0..3000 {
+        solver.solve(frames.next(), &mut out).expect("a good frame");
+    }
+    criterion.bench_function("whole frame without expression weights", |bencher| {
+        bencher.iter(|| solver.solve(black_box(frames.next()), &mut out));
+    });
 
     let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(None, None)).expect("a good session");
     let named: Vec<(&str, f32)> = ["jawOpen", "mouthSmileLeft", "browInnerUp", "eyeBlinkLeft"].map(|name| (name, 0.4)).into();
@@ -126,6 +135,8 @@ fn calibration(criterion: &mut Criterion) {
     };
     let mut group = criterion.benchmark_group("calibration");
     group.sample_size(30);
+    // Once for each character that is loaded.
+    group.bench_function("train the expression weights", |bencher| bencher.iter(|| ExpressionMap::fit(black_box(&character))));
     group.bench_function("asked for", |bencher| {
         bencher.iter_batched_ref(|| after(100), |(solver, _)| solver.calibrate(), BatchSize::PerIteration)
     });

@@ -12,6 +12,7 @@ mod config;
 mod depth;
 mod easing;
 mod error;
+mod estimate;
 mod evaluate;
 mod expressions;
 mod filter;
@@ -33,6 +34,7 @@ mod zones;
 
 /// The stages by themselves: for benchmarks, and for whoever builds another pipeline of them.
 pub mod stages {
+    pub use super::estimate::{ExpressionMap, FitReport, ShapeFit};
     pub use super::evaluate::Evaluator;
     pub use super::filter::OneEuroBank;
     pub use super::head_pose::{Fit, Pose, lift, refine};
@@ -253,10 +255,11 @@ impl Solver {
             }
         }
         let source = self.aim_bones(frame.t, &frame.data)?;
-        // What the publisher says of expressions counts before what weights say.
+        // What the publisher says of expressions counts before what weights say. Weights that are estimated lack what landmarks
+        // hardly show: the bones' influences, which the same landmarks drive, say more.
         let known = match (&frame.expressions, &self.target.weights, &self.zones) {
             (Some(amounts), _, _) => Some(ZoneRig::given(amounts)),
-            (None, Some(weights), Some(zones)) => zones.read(weights),
+            (None, Some(weights), Some(zones)) if source == Some(Source::Weights) => zones.read(weights),
             _ => None,
         };
         self.target.bridge = if known.is_none() { 1.0 } else { 0.0 };

@@ -6,7 +6,7 @@ use rhytid_server::pipeline::Pipeline;
 use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::layout::{IBUG_FROM_MEDIAPIPE, Layout};
 use rhytid_shared::limits::MAX_EXPRESSIONS;
-use rhytid_shared::{FaceFrame, HeadPose, TrackingData, TrackingFrame};
+use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, FaceFrame, HeadPose, TrackingData, TrackingFrame};
 use solve_fixture::{character_with_zones, feed, hello, landmark_frame, weight_frame};
 use std::alloc::{GlobalAlloc, Layout as MemoryLayout, System};
 use std::cell::Cell;
@@ -75,6 +75,26 @@ fn frames_allocate_nothing() {
     }
     assert_eq!(NUM_ALLOCATIONS.get(), before);
     assert!(out.zones[0] > 0.5);
+}
+
+/// The fixture has no shapes that landmarks tell; the built-in character has.
+#[test]
+fn expression_weights_allocate_nothing() {
+    let character = std::sync::Arc::new(Character::from_glb(DEFAULT_CHARACTER_GLB).expect("the built-in character is sound"));
+    let mut solver = Solver::new(character.clone(), &SolveConfig::default(), &hello(Some(Layout::Ibug68), None)).expect("a good session");
+    let mut out = FaceFrame::at_rest(&character);
+    let frames = feed(&character, 100);
+    // The first neutral stands by then.
+    let (before, after) = frames.split_at(80);
+    for frame in before {
+        solver.solve(frame, &mut out).expect("a good frame");
+    }
+    let num = NUM_ALLOCATIONS.get();
+    for frame in after {
+        solver.solve(frame, &mut out).expect("a good frame");
+    }
+    assert!(out.shapes.is_some(), "weights are estimated");
+    assert_eq!(NUM_ALLOCATIONS.get(), num);
 }
 
 /// Frames that allocate after the first `num_first`, through the solve and the encoder.

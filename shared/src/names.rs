@@ -121,6 +121,16 @@ impl ArkitShape {
             .map(|index| Self(index as u8))
     }
 
+    /// The shape a morph target of this name belongs to. Other heads split shapes that ARKit has once into halves
+    /// (`browInnerUp_L`, `cheekPuff_R`): both belong to the whole, and their displacements add up to it.
+    pub fn of_target(name: &str) -> Option<Self> {
+        let half = || {
+            let (stem, side) = name.split_at_checked(name.len().checked_sub(2)?)?;
+            matches!(side, "_L" | "_l" | "_R" | "_r").then_some(stem)
+        };
+        Self::from_name(name).or_else(|| Self::from_name(half()?))
+    }
+
     /// The shape at `index` of [`ARKIT_NAMES`], if there is one.
     pub fn from_index(index: usize) -> Option<Self> {
         (index < NUM_ARKIT_SHAPES).then_some(Self(index as u8))
@@ -150,6 +160,64 @@ mod tests {
         }
         for name in ["", "_neutral", "jaw", "_L", "é_L", "jawOpen_L"] {
             assert_eq!(ArkitShape::from_name(name), None, "{name}");
+        }
+    }
+
+    #[test]
+    fn halves_of_a_target_belong_to_the_whole_shape() {
+        for (name, want) in
+            [("browInnerUp_L", Some("browInnerUp")), ("cheekPuff_R", Some("cheekPuff")), ("eyeBlink_L", Some("eyeBlinkLeft"))]
+        {
+            assert_eq!(ArkitShape::of_target(name).map(ArkitShape::name), want, "{name}");
+        }
+        // All that the ICT FaceKit's head has: of 57 targets four are none of ARKit's, the rest makes all shapes but the tongue.
+        let sided = [
+            "PupilDilate",
+            "browDown",
+            "browInnerUp",
+            "browOuterUp",
+            "cheekPuff",
+            "cheekRaiser",
+            "cheekSquint",
+            "eyeBlink",
+            "eyeLookDown",
+            "eyeLookIn",
+            "eyeLookOut",
+            "eyeLookUp",
+            "eyeSquint",
+            "eyeWide",
+            "mouthDimple",
+            "mouthFrown",
+            "mouthLowerDown",
+            "mouthPress",
+            "mouthSmile",
+            "mouthStretch",
+            "mouthUpperUp",
+            "noseSneer",
+        ];
+        let whole = [
+            "jawForward",
+            "jawLeft",
+            "jawOpen",
+            "jawRight",
+            "mouthClose",
+            "mouthFunnel",
+            "mouthLeft",
+            "mouthPucker",
+            "mouthRight",
+            "mouthRollLower",
+            "mouthRollUpper",
+            "mouthShrugLower",
+            "mouthShrugUpper",
+        ];
+        let names = sided.iter().flat_map(|stem| [format!("{stem}_L"), format!("{stem}_R")]).chain(whole.map(str::to_owned));
+        let found: Vec<Option<ArkitShape>> = names.map(|name| ArkitShape::of_target(&name)).collect();
+        assert_eq!((found.len(), found.iter().filter(|shape| shape.is_none()).count()), (57, 4));
+        let distinct: std::collections::BTreeSet<ArkitShape> = found.into_iter().flatten().collect();
+        assert_eq!(distinct.len(), NUM_ARKIT_SHAPES - 1);
+        assert!(!distinct.iter().any(|shape| shape.name() == "tongueOut"));
+        for name in ["", "_L", "PupilDilate_L", "cheekRaiser_R", "é_L"] {
+            assert_eq!(ArkitShape::of_target(name), None, "{name}");
         }
     }
 

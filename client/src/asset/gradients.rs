@@ -19,6 +19,28 @@ pub fn triangle_gradient(corners: [Vec3; 3], values: [f32; 3]) -> Vec3 {
     sum / squared
 }
 
+/// Vertices by where they are: those on either side of a texture seam are at one place.
+pub(super) struct Places {
+    /// The place of each vertex.
+    pub(super) of: Vec<usize>,
+    /// How many places there are.
+    pub(super) num: usize,
+}
+
+impl Places {
+    pub(super) fn new(positions: &[Vec3]) -> Self {
+        let mut known: HashMap<[u32; 3], usize> = HashMap::with_capacity(positions.len());
+        let of = positions
+            .iter()
+            .map(|position| {
+                let next = known.len();
+                *known.entry(position.to_array().map(f32::to_bits)).or_insert(next)
+            })
+            .collect();
+        Self { of, num: known.len() }
+    }
+}
+
 /// A vertex's skinning with the gradients of its weights.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SkinnedWeights {
@@ -35,18 +57,11 @@ pub struct SkinnedWeights {
 ///
 /// `positions`, `joints` and `weights` have one entry a vertex, `indices` three a triangle.
 pub fn weight_gradients(positions: &[Vec3], indices: &[u32], joints: &[[u16; 4]], weights: &[[f32; 4]]) -> Vec<SkinnedWeights> {
-    let mut place_of_bits: HashMap<[u32; 3], usize> = HashMap::with_capacity(positions.len());
-    let place_of: Vec<usize> = positions
-        .iter()
-        .map(|position| {
-            let next = place_of_bits.len();
-            *place_of_bits.entry(position.to_array().map(f32::to_bits)).or_insert(next)
-        })
-        .collect();
+    let Places { of: place_of, num: num_places } = Places::new(positions);
 
     // Per place: total area, and area-weighted gradient by joint.
-    let mut area = vec![0.0_f32; place_of_bits.len()];
-    let mut sums: Vec<Vec<(u16, Vec3)>> = vec![Vec::new(); place_of_bits.len()];
+    let mut area = vec![0.0_f32; num_places];
+    let mut sums: Vec<Vec<(u16, Vec3)>> = vec![Vec::new(); num_places];
     for triangle in indices.as_chunks::<3>().0 {
         let corners = triangle.map(|index| index as usize);
         let points = corners.map(|corner| positions[corner]);

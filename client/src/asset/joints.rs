@@ -47,6 +47,16 @@ impl Palette {
         };
         self.motions.iter().map(of_motion).collect()
     }
+
+    /// As [`Self::model_from_rest`], with all bones at rest on a head that moves: for a face that its shapes deform.
+    pub fn model_from_unposed(&self, character: &Character, frame: &RenderFrame) -> Vec<Affine3A> {
+        let head = model_from_head(character, frame);
+        let of_motion = |motion: &JointMotion| match *motion {
+            JointMotion::Still | JointMotion::Bone { follows_head: false, .. } => Affine3A::IDENTITY,
+            JointMotion::Head | JointMotion::Bone { follows_head: true, .. } => head,
+        };
+        self.motions.iter().map(of_motion).collect()
+    }
 }
 
 /// The rigid motion of the head: about its pivot, then to its place.

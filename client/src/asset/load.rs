@@ -4,10 +4,11 @@ use super::blood;
 use super::gradients::weight_gradients;
 use super::joints::{JointMotion, Palette};
 use super::mips::{MipChain, Texels};
+use super::morphs::{MorphedMesh, Morphs};
 use super::{Alpha, AssetError, CharacterAsset, MaterialAsset, PrimitiveAsset, Surface, Vertex, WrinkleMaps, ZoneMaps};
 use glam::{Vec2, Vec3};
 use image::RgbaImage;
-use rhytid_shared::{Character, CharacterError};
+use rhytid_shared::{ArkitShape, Character, CharacterError};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -25,11 +26,14 @@ pub(super) fn load(bytes: &[u8]) -> Result<CharacterAsset> {
     let mut images = Images { document: &gltf.document, blob, last: None };
 
     let mut primitives = Vec::new();
+    let mut morphs = Morphs::default();
     for mesh in gltf.document.meshes() {
+        let targets = shape_of_target(&mesh);
         for primitive in mesh.primitives() {
-            let (vertices, indices) = read_triangles(&primitive, blob, &entry_of_joint);
+            let (mut vertices, indices) = read_triangles(&primitive, blob, &entry_of_joint);
             let material = primitive.material();
             let name = material.name().unwrap_or_default().to_owned();
+            read_morphs(&primitive, blob, &targets, &name, &mut vertices, &indices, &mut morphs)?;
             primitives.push(PrimitiveAsset {
                 surface: Surface::from_material_name(&name),
                 name,
@@ -42,7 +46,7 @@ pub(super) fn load(bytes: &[u8]) -> Result<CharacterAsset> {
     let wrinkles = read_wrinkles(&character, &mut images)?;
     let zones = read_zones(&character, &mut images)?;
     let blood = blood::read(&character, |texture| images.of_texture(texture).map(|image| image.cloned()))?;
-    Ok(CharacterAsset { character: Arc::new(character), primitives, palette, wrinkles, zones, blood })
+    Ok(CharacterAsset { character: Arc::new(character), primitives, palette, morphs, wrinkles, zones, blood })
 }
 
 /// Names from a joint up to the root.
@@ -148,10 +152,52 @@ fn read_triangles(primitive: &gltf::Primitive<'_>, blob: &[u8], entry_of_joint: 
                 joints: skinned[v].joints.map(|joint| joint as u8),
                 weights: skinned[v].weights,
                 gradients: [1, 2, 3].map(|slot| [skinned[v].gradients[slot].dot(tangent), skinned[v].gradients[slot].dot(bitangent)]),
+                morphs: [0; 2],
             }
         })
         .collect();
     (vertices, indices)
+}
+
+/// Reads the targets of a part that stand for expression shapes, and tells each vertex which entries are its own.
+fn read_morphs(
+    primitive: &gltf::Primitive<'_>,
+    blob: &[u8],
+    targets: &[Option<ArkitShape>],
+    name: &str,
+    vertices: &mut [Vertex],
+    indices: &[u32],
+    morphs: &mut Morphs,
+) -> Result<()> {
+    let reader = primitive.reader(|buffer| matches!(buffer.source(), gltf::buffer::Source::Bin).then_some(blob));
+    let positions: Vec<Vec3> = vertices.iter().map(|vertex| Vec3::from(vertex.position)).collect();
+    let frames: Vec<[Vec3; 2]> = vertices
+        .iter()
+        .map(|vertex| {
+            let [x, y, z, _] = vertex.tangent;
+            let tangent = Vec3::new(x, y, z);
+            [tangent, Vec3::from(vertex.normal).cross(tangent)]
+        })
+        .collect();
+    let mut by_shape: Vec<(ArkitShape, usize)> = targets.iter().enumerate().filter_map(|(t, shape)| Some(((*shape)?, t))).collect();
+    by_shape.sort_unstable();
+    let displacements = by_shape.into_iter().filter_map(|(shape, target)| {
+        let (displacements, _, _) = reader.read_morph_targets().nth(target)?;
+        let deltas: Vec<Vec3> = displacements?.map(Vec3::from).collect();
+        Some((shape, deltas)).filter(|(_, deltas)| deltas.len() == positions.len())
+    });
+    let spans = morphs.add(&MorphedMesh { name, positions: &positions, indices, frames: &frames }, displacements)?;
+    for (vertex, span) in vertices.iter_mut().zip(spans) {
+        vertex.morphs = span;
+    }
+    Ok(())
+}
+
+/// The expression shape that each target of a mesh stands for, by its name.
+fn shape_of_target(mesh: &gltf::Mesh<'_>) -> Vec<Option<ArkitShape>> {
+    let extras = mesh.extras().as_ref().and_then(|extras| serde_json::from_str::<serde_json::Value>(extras.get()).ok());
+    let names = extras.as_ref().and_then(|extras| extras.get("targetNames")).and_then(|names| names.as_array());
+    names.into_iter().flatten().map(|name| name.as_str().and_then(ArkitShape::of_target)).collect()
 }
 
 /// `tangent` made unit and orthogonal to `normal`; any such direction where that leaves nothing.

@@ -48,6 +48,8 @@ impl Layouts {
                 uniform(2, Stages::VERTEX_FRAGMENT, size_of::<uniforms::PoseTable>()),
                 binding(3, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
                 binding(4, Stages::FRAGMENT, sampler),
+                binding(5, Stages::VERTEX, texture(wgpu::TextureSampleType::Float { filterable: false }, wgpu::TextureViewDimension::D2)),
+                uniform(6, Stages::VERTEX, size_of::<uniforms::MorphWeights>()),
                 binding(7, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
                 binding(8, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
                 binding(9, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),

@@ -330,6 +330,7 @@ pub const VERTEX_LAYOUT: wgpu::VertexBufferLayout<'static> = wgpu::VertexBufferL
         attribute(5, std::mem::offset_of!(Vertex, weights), wgpu::VertexFormat::Float32x4),
         attribute(6, std::mem::offset_of!(Vertex, gradients), wgpu::VertexFormat::Float32x4),
         attribute(7, std::mem::offset_of!(Vertex, gradients) + 16, wgpu::VertexFormat::Float32x2),
+        attribute(8, std::mem::offset_of!(Vertex, morphs), wgpu::VertexFormat::Uint32x2),
     ],
 };
 

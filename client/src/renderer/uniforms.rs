@@ -3,6 +3,7 @@
 use crate::asset::Palette;
 use glam::Affine3A;
 use rhytid_shaders::assert_layout;
+use rhytid_shared::NUM_ARKIT_SHAPES;
 use rhytid_shared::limits::{MAX_BONES, MAX_POSES};
 
 /// Vec4s a bone in the largest layout.
@@ -110,6 +111,27 @@ assert_layout!(PoseTable, pose_table, {
     num_bones: NUM_BONES,
     falloff: FALLOFF,
 });
+
+/// Weights of the expression shapes.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct MorphWeights {
+    /// In the order of [`rhytid_shared::ARKIT_NAMES`].
+    pub shapes: [f32; NUM_ARKIT_SHAPES],
+    /// 0: no shape moves anything.
+    pub is_active: u32,
+    /// Fills the block up.
+    pub padding: [u32; 3],
+}
+assert_layout!(MorphWeights, morph_weights, { shapes: SHAPES, is_active: IS_ACTIVE });
+
+impl MorphWeights {
+    /// Those of a frame; all 0 where the bones deform it.
+    pub fn new(weights: Option<&[f32; NUM_ARKIT_SHAPES]>) -> Self {
+        let shapes = weights.copied().unwrap_or([0.0; NUM_ARKIT_SHAPES]);
+        Self { is_active: u32::from(shapes.iter().any(|weight| *weight != 0.0)), shapes, padding: [0; 3] }
+    }
+}
 
 /// Zone weights, four a vec4 as in the masks.
 #[repr(C)]

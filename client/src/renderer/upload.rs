@@ -5,13 +5,15 @@ use super::coefficients::pose_table;
 use super::layouts::Layouts;
 use super::regions::{self, Region};
 use super::uniforms;
-use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, PrimitiveAsset, Surface, Texels};
+use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, Morphs, PrimitiveAsset, Surface, Texels};
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 use wgpu::util::DeviceExt;
 
 /// Sides of a texel's footprint that are sampled at most: skin is seen at grazing angles all round its outline.
 const ANISOTROPY: u16 = 8;
+/// Half precision: 8 µm for a displacement of 16 mm.
+const MORPH_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;
 
 /// Creates objects on one device and counts their bytes.
 #[derive(Debug)]
@@ -39,11 +41,12 @@ pub struct Primitive {
     pub material: wgpu::BindGroup,
 }
 
-/// What of a character changes from frame to frame, and its wrinkle maps: group 1.
+/// What of a character changes from frame to frame, its shapes and its wrinkle maps: group 1.
 #[derive(Debug)]
 pub struct CharacterGroup {
     pub palette: wgpu::Buffer,
     pub coefficients: wgpu::Buffer,
+    pub morph_weights: wgpu::Buffer,
     pub zone_weights: wgpu::Buffer,
     /// Change of haemoglobin.
     pub blood: wgpu::Texture,
@@ -165,6 +168,8 @@ impl Uploader<'_> {
         let view =
             maps.create_view(&wgpu::TextureViewDescriptor { dimension: Some(wgpu::TextureViewDimension::D2Array), ..Default::default() });
         let sampler = self.map_sampler("wrinkle sampler");
+        let morph_deltas = self.morph_deltas(&asset.morphs);
+        let morph_weights = self.uniform("morph weights", size_of::<uniforms::MorphWeights>());
         let zone_weights = self.uniform("zone weights", size_of::<uniforms::ZoneWeights>());
         let (no_mask, no_difference) =
             (MipChain::uniform([1, 1], Texels::Linear4, &[0; 4]), MipChain::uniform([1, 1], Texels::Linear4, &[128; 4]));
@@ -196,6 +201,8 @@ impl Uploader<'_> {
                 entry(2, table.as_entire_binding()),
                 entry(3, wgpu::BindingResource::TextureView(&view)),
                 entry(4, wgpu::BindingResource::Sampler(&sampler)),
+                entry(5, wgpu::BindingResource::TextureView(&morph_deltas)),
+                entry(6, morph_weights.as_entire_binding()),
                 entry(7, wgpu::BindingResource::TextureView(&masks)),
                 entry(8, wgpu::BindingResource::TextureView(&zone_maps)),
                 entry(9, wgpu::BindingResource::TextureView(&difference)),
@@ -203,7 +210,7 @@ impl Uploader<'_> {
                 entry(11, wgpu::BindingResource::TextureView(&blood.create_view(&wgpu::TextureViewDescriptor::default()))),
             ],
         });
-        CharacterGroup { palette, coefficients, zone_weights, blood, zone_bytes, group }
+        CharacterGroup { palette, coefficients, morph_weights, zone_weights, blood, zone_bytes, group }
     }
 
     /// The map of blood, `side` texels a side, as it is at rest.
@@ -221,6 +228,30 @@ impl Uploader<'_> {
         self.bytes += u64::from(side) * u64::from(side);
         write_blood(self.queue, &texture, &vec![blood::UNCHANGED; (side * side) as usize]);
         texture
+    }
+
+    /// The deltas of all shapes; rows are filled up with zeros.
+    fn morph_deltas(&mut self, morphs: &Morphs) -> wgpu::TextureView {
+        let [width, height] = morphs.texture_size();
+        let mut texels = morphs.texels.clone();
+        texels.resize((width * height) as usize, [half::f16::ZERO; 4]);
+        self.bytes += size_of_val(texels.as_slice()) as u64;
+        let texture = self.device.create_texture_with_data(
+            self.queue,
+            &wgpu::TextureDescriptor {
+                label: Some("morph deltas"),
+                size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+                mip_level_count: 1,
+                sample_count: 1,
+                dimension: wgpu::TextureDimension::D2,
+                format: MORPH_FORMAT,
+                usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+                view_formats: &[],
+            },
+            wgpu::util::TextureDataOrder::LayerMajor,
+            bytemuck::cast_slice(&texels),
+        );
+        texture.create_view(&wgpu::TextureViewDescriptor::default())
     }
 
     /// One part with its material.

@@ -6,7 +6,7 @@ use super::rates::Rate;
 use super::switches::{Page, Switches, views};
 use crate::link::LinkStats;
 use crate::playout::PlayoutStats;
-use crate::renderer::{BlendMode, RenderFrame, ViewMode};
+use crate::renderer::{BlendMode, Deformation, RenderFrame, ViewMode};
 use crate::spectator::{Status, StatusKind};
 use egui::{Align2, Color32, CornerRadius, FontId, Frame, Margin, Pos2, Rect, RichText, Sense, Ui, pos2, vec2};
 use rhytid_shared::Character;
@@ -151,6 +151,8 @@ fn contents(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) {
     pages::choice(ui, switches);
     match switches.page {
         Page::Face => {
+            look::section(ui, "Deformation");
+            deformation_switches(ui, scene, switches);
             look::section(ui, "Link");
             numbers(ui, scene);
             look::section(ui, "Reference poses");
@@ -209,6 +211,27 @@ fn wrinkle_switches(ui: &mut Ui, switches: &mut Switches) {
             }
         }
     });
+}
+
+fn deformation_switches(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) {
+    let choices = [
+        (Deformation::Bones, "Bones", "Bones move the face (Dutreve et al. 2009)"),
+        (Deformation::Shapes, "Shapes", "The mesh's own expression shapes move the face, by weights that come with the frames"),
+    ];
+    let width = (ui.available_width() - ui.spacing().item_spacing.x) / 2.0;
+    ui.horizontal(|ui| {
+        for (deform, name, hint) in choices {
+            if ui.add_sized([width, 28.0], look::switch(name, switches.draw.deform == deform)).on_hover_text(hint).clicked() {
+                switches.draw.deform = deform;
+            }
+        }
+    });
+    let problem = match switches.draw.deform {
+        Deformation::Shapes if scene.character.shapes.is_empty() => "This character has no shapes: bones move it.",
+        Deformation::Shapes if scene.frame.shapes.is_none() => "No weights come with the frames: bones move the face.",
+        _ => return,
+    };
+    ui.label(RichText::new(problem).small().color(FAINT));
 }
 
 fn numbers(ui: &mut Ui, scene: &Scene<'_>) {
@@ -295,6 +318,6 @@ fn pose_bars(ui: &mut Ui, scene: &Scene<'_>, k: usize, name: &str) {
 }
 
 fn key_help(ui: &mut Ui) {
-    let text = "1–6 view   W wrinkles   Z whose   B blend   L light\nP page   H panel   F full screen   R camera   Esc quit\nDrag to turn, wheel to zoom";
+    let text = "1–6 view   W wrinkles   Z whose   B blend   D deform\nL light   P page   H panel   F full screen   R camera   Esc quit\nDrag to turn, wheel to zoom";
     ui.label(RichText::new(text).small().color(FAINT));
 }

@@ -1,6 +1,6 @@
 //! What the person before the window has chosen.
 
-use crate::renderer::{BlendMode, Camera, DrawSettings, Studio, ViewMode, WrinkleSystem};
+use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, Studio, ViewMode, WrinkleSystem};
 use egui::{Key, Modifiers};
 use rhytid_shared::Character;
 
@@ -83,6 +83,12 @@ impl Switches {
         if pressed(Key::B) {
             let at = BlendMode::ALL.iter().position(|&mode| mode == self.draw.blend).unwrap_or(0);
             self.draw.blend = BlendMode::ALL[(at + 1) % BlendMode::ALL.len()];
+        }
+        if pressed(Key::D) {
+            self.draw.deform = match self.draw.deform {
+                Deformation::Bones => Deformation::Shapes,
+                Deformation::Shapes => Deformation::Bones,
+            };
         }
         if pressed(Key::L) {
             let at = Studio::ALL.iter().position(|&studio| studio == self.draw.studio).unwrap_or(0);
@@ -223,10 +229,11 @@ mod tests {
         for mode in [1, 2, 0].map(|at| BlendMode::ALL[at]) {
             assert_eq!(desk.press(Key::B).draw.blend, mode);
         }
+        assert_eq!(desk.press(Key::D).draw.deform, Deformation::Shapes);
         assert_eq!(desk.press(Key::L).draw.studio, Studio::Sunset);
         assert_eq!(desk.press(Key::Z).draw.system, WrinkleSystem::Bones);
         assert_eq!(desk.press(Key::P).page, Page::Zones);
-        for key in [Key::W, Key::H, Key::F, Key::L, Key::Z, Key::Z, Key::Z, Key::P, Key::P, Key::P] {
+        for key in [Key::W, Key::D, Key::H, Key::F, Key::L, Key::Z, Key::Z, Key::Z, Key::P, Key::P, Key::P] {
             desk.press(key);
         }
         assert_eq!(desk.switches, before, "pressed again they switch back");

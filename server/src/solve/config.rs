@@ -12,6 +12,9 @@ pub struct SolveConfig {
     pub ridge: f64,
     /// Largest root-mean-square reprojection error of an accepted head pose, as a fraction of the interocular distance.
     pub max_reprojection: f64,
+    /// Expression weights are estimated from landmarks and sent along: for faces of shapes, zones and exports. Costs bytes and
+    /// time; the face of bones is the same with and without.
+    pub estimate_weights: bool,
     /// Smoothing.
     pub filter: FilterConfig,
     /// Search for the neutral face.
@@ -84,6 +87,7 @@ impl Default for SolveConfig {
             ridge: 0.0,
             // Good frames of three performers stay below 0.03, with smiles that lift the nostrils.
             max_reprojection: 0.05,
+            estimate_weights: true,
             filter: FilterConfig::default(),
             calibration: CalibrationConfig::default(),
             lost: LostConfig::default(),

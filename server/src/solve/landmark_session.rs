@@ -6,6 +6,7 @@ use super::config::SolveConfig;
 use super::depth::Shape;
 use super::easing::FaceState;
 use super::error::SolveError;
+use super::estimate::Estimator;
 use super::filter::{LONGEST_GAP, OneEuroBank};
 use super::head_pose::{self, Fit, Pose};
 use super::ingest::{Camera, Observation};
@@ -17,6 +18,7 @@ use glam::{DQuat, DVec2, DVec3};
 use rhytid_shared::layout::Layout;
 use rhytid_shared::limits::MAX_HEAD_TRAVEL;
 use rhytid_shared::{Character, PublishHello};
+use std::sync::Arc;
 
 /// A head pose that fits badly is refused for this long, seconds; what lasts longer is no outlier.
 const LONGEST_REFUSAL: f64 = 0.5;
@@ -67,6 +69,8 @@ pub(super) struct LandmarkSession {
     calibrator: Calibrator,
     calibration: Option<Calibration>,
     retarget: Option<Retarget>,
+    /// Where weights are wanted and can be told.
+    estimator: Option<Estimator>,
 }
 
 /// What a frame did besides its face.
@@ -78,7 +82,7 @@ pub(super) struct Solved {
 }
 
 impl LandmarkSession {
-    pub(super) fn new(character: &Character, config: &SolveConfig, layout: &Layout, hello: &PublishHello) -> Result<Self, SolveError> {
+    pub(super) fn new(character: &Arc<Character>, config: &SolveConfig, layout: &Layout, hello: &PublishHello) -> Result<Self, SolveError> {
         let camera = Camera::new(hello, config.mirror)?;
         let points = PointSet::new(character, layout, config.mirror)?;
         let unit = f64::from(character.interocular());
@@ -127,6 +131,7 @@ impl LandmarkSession {
             calibrator: Calibrator::new(&config.calibration, num, points.is_ibug.then_some(ibug_strain)),
             calibration: None,
             retarget: None,
+            estimator: if config.estimate_weights { Estimator::new(character, &points) } else { None },
             prior: model.iter().map(|point| point.z).collect(),
             believed_spread: (0..num)
                 .map(|i| if groups[i] == Group::Mouth && !points.is_stable(i) { MOVING_SPREAD } else { STILL_SPREAD })
@@ -265,7 +270,8 @@ impl LandmarkSession {
             retarget.solve(&self.smoothed, &mut state.motions);
         }
         self.write_head(dt, state);
-        state.weights = None;
+        let motions = &state.motions;
+        state.weights = self.estimator.as_mut().map(|estimator| estimator.estimate(&self.smoothed, motions));
         state.is_placed = false;
         Ok(solved)
     }
@@ -345,6 +351,9 @@ impl LandmarkSession {
     fn adopt(&mut self, character: &Character, calibration: Calibration) -> Result<(), SolveError> {
         let neutral: Vec<DVec2> = calibration.points.iter().map(|p| DVec2::new(p[0], p[1])).collect();
         self.retarget = Some(Retarget::new(character, &self.points, &neutral, self.config.ridge)?);
+        if let Some(estimator) = &mut self.estimator {
+            estimator.adopt(&neutral);
+        }
         for (model, neutral) in self.model.iter_mut().zip(&calibration.points) {
             *model = DVec3::from(*neutral);
         }

@@ -143,6 +143,7 @@ pub fn character() -> Arc<Character> {
             .iter()
             .map(|bone| moved.iter().find(|(name, _)| *name == bone.name).map_or(Vec3::ZERO, |(_, mm)| Vec3::from(*mm) * 1e-3))
             .collect(),
+        landmarks: vec![Vec3::ZERO; 68],
     };
     let shapes = vec![
         delta("jawOpen", &[("jaw", [0.0, -22.0, -14.0]), ("chin", [0.0, -22.0, -14.0]), ("lip_lower_mid", [0.0, -20.0, -9.0])]),

@@ -1,4 +1,4 @@
-// Linear-blend skinning with normals that follow translating bones, and the vertex influences of Dutreve et al. 2009, 5.2.
+// Expression shapes, linear-blend skinning with normals that follow both, and the vertex influences of Dutreve et al. 2009, 5.2.
 
 // Reference poses of the character, at most 8.
 override NUM_POSES: u32 = 4u;
@@ -30,6 +30,19 @@ struct PoseTable {
 @group(1) @binding(1) var<uniform> coefficients: Coefficients;
 @group(1) @binding(2) var<uniform> pose_table: PoseTable;
 
+// Weights of the expression shapes.
+struct MorphWeights {
+    // In ARKit's order, four a vector.
+    shapes: array<vec4<f32>, 13>,
+    // 0: no shape moves anything, the deltas are not read.
+    is_active: u32,
+}
+
+// Three texels an entry, entries side by side: displacement and number of its shape, then how the displacement changes
+// along tangent and bitangent.
+@group(1) @binding(5) var morph_deltas: texture_2d<f32>;
+@group(1) @binding(6) var<uniform> morph_weights: MorphWeights;
+
 struct VertexIn {
     @location(0) position: vec3<f32>,
     @location(1) normal: vec3<f32>,
@@ -39,6 +52,8 @@ struct VertexIn {
     @location(5) weights: vec4<f32>,
     @location(6) gradients_1_2: vec4<f32>,
     @location(7) gradient_3: vec2<f32>,
+    // First entry in the deltas and number of entries.
+    @location(8) morphs: vec2<u32>,
 }
 
 struct Deformed {
@@ -52,12 +67,42 @@ fn transform(joint: u32, v: vec4<f32>) -> vec3<f32> {
     return vec3<f32>(dot(palette.rows[row], v), dot(palette.rows[row + 1u], v), dot(palette.rows[row + 2u], v));
 }
 
+// A vertex of the neutral mesh after the expression shapes: where it is, and what its tangent and bitangent have become,
+// neither unit nor orthogonal.
+struct Morphed {
+    position: vec3<f32>,
+    tangent: vec3<f32>,
+    bitangent: vec3<f32>,
+}
+
+fn morph(in: VertexIn) -> Morphed {
+    var out = Morphed(in.position, in.tangent.xyz, cross(in.normal, in.tangent.xyz));
+    if morph_weights.is_active == 0u {
+        return out;
+    }
+    let per_row = textureDimensions(morph_deltas).x / 3u;
+    for (var entry = in.morphs.x; entry < in.morphs.x + in.morphs.y; entry += 1u) {
+        let at = vec2<i32>(i32(entry % per_row) * 3, i32(entry / per_row));
+        let delta = textureLoad(morph_deltas, at, 0);
+        let shape = u32(delta.w);
+        let weight = morph_weights.shapes[shape / 4u][shape % 4u];
+        if weight != 0.0 {
+            out.position += weight * delta.xyz;
+            out.tangent += weight * textureLoad(morph_deltas, at + vec2<i32>(1, 0), 0).xyz;
+            out.bitangent += weight * textureLoad(morph_deltas, at + vec2<i32>(2, 0), 0).xyz;
+        }
+    }
+    return out;
+}
+
 // F = sum w_i A_i + sum (M_i v)(grad w_i)^T. With t, b, n orthonormal, cof(F) n = cof(F)(t x b) = F t x F b.
 // The gradients sum to zero, so M_0 v is taken off the other three and weight 0's own gradient is not needed.
+// With shapes v, t and b are the morphed ones: the chain rule leaves the rest as it is.
 fn deform(in: VertexIn) -> Deformed {
-    let v = vec4<f32>(in.position, 1.0);
-    let t = vec4<f32>(in.tangent.xyz, 0.0);
-    let bitangent = vec4<f32>(cross(in.normal, in.tangent.xyz), 0.0);
+    let morphed = morph(in);
+    let v = vec4<f32>(morphed.position, 1.0);
+    let t = vec4<f32>(morphed.tangent, 0.0);
+    let bitangent = vec4<f32>(morphed.bitangent, 0.0);
     let moved_0 = transform(in.joints.x, v);
     let moved_1 = transform(in.joints.y, v);
     let moved_2 = transform(in.joints.z, v);

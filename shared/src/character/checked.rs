@@ -173,7 +173,7 @@ pub struct WrinkleMap {
     pub contains_neutral: bool,
 }
 
-/// An expression shape's effect on the bones at weight 1.
+/// An expression shape's effect on bones and landmarks at weight 1.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShapeDeltas {
     /// Which shape.
@@ -182,6 +182,8 @@ pub struct ShapeDeltas {
     pub target: usize,
     /// `n` displacements of the mesh at the bones' points, metres.
     pub deltas: Vec<Vec3>,
+    /// 68 displacements of the mesh at the landmarks, metres.
+    pub landmarks: Vec<Vec3>,
 }
 
 /// An authored combination, checked.

@@ -124,7 +124,7 @@ fn hex(bytes: &[u8]) -> String {
 fn check_meshes(document: &gltf::Document, blob: &[u8], character: &mut Character) -> Result<()> {
     let num_joints = document.skins().next().map_or(0, |skin| skin.joints().count());
     let (mut num_vertices, mut num_indices) = (0, 0);
-    let mut nearest = vec![f32::INFINITY; character.num_bones()];
+    let mut samples = Samples::new(character);
     for mesh in document.meshes() {
         let targets = target_names(&mesh);
         for primitive in mesh.primitives() {
@@ -154,7 +154,7 @@ fn check_meshes(document: &gltf::Document, blob: &[u8], character: &mut Characte
             }
             check_indices(&reader, positions.len(), &field)?;
             check_weights(&reader, num_joints, &field)?;
-            sample_shapes(&reader, &targets, &positions, &mut nearest, character, &field)?;
+            sample_shapes(&reader, &targets, &positions, &mut samples, character, &field)?;
         }
     }
     if num_vertices == 0 {
@@ -211,7 +211,7 @@ fn target_names(mesh: &gltf::Mesh<'_>) -> Vec<Option<ArkitShape>> {
     let Some(extras) = mesh.extras() else { return Vec::new() };
     let Ok(extras) = serde_json::from_str::<serde_json::Value>(extras.get()) else { return Vec::new() };
     let Some(names) = extras.get("targetNames").and_then(|names| names.as_array()) else { return Vec::new() };
-    names.iter().map(|name| name.as_str().and_then(ArkitShape::from_name)).collect()
+    names.iter().map(|name| name.as_str().and_then(ArkitShape::of_target)).collect()
 }
 
 type PrimitiveReader<'a, 's, F> = Reader<'a, 's, F>;
@@ -259,48 +259,72 @@ where
     Ok(())
 }
 
-/// Takes each shape's displacement at the mesh vertex nearest to each bone's point.
+/// Where shapes are sampled: each bone's point, then each landmark; and how near the nearest vertex so far is to it, squared.
+struct Samples {
+    places: Vec<Vec3>,
+    nearest: Vec<f32>,
+}
+
+impl Samples {
+    fn new(character: &Character) -> Self {
+        let places: Vec<Vec3> = character.bones.iter().map(|bone| bone.rest).chain(character.ibug68.iter().copied()).collect();
+        Self { nearest: vec![f32::INFINITY; places.len()], places }
+    }
+
+    /// The places that these vertices come nearer to than those before them, each with the nearest.
+    fn take_nearer(&mut self, positions: &[Vec3]) -> Vec<(usize, usize)> {
+        let mut taken = Vec::new();
+        for (i, (place, nearest)) in self.places.iter().zip(&mut self.nearest).enumerate() {
+            let mut best = None;
+            for (v, position) in positions.iter().enumerate() {
+                let distance = position.distance_squared(*place);
+                if distance < *nearest {
+                    *nearest = distance;
+                    best = Some(v);
+                }
+            }
+            taken.extend(best.map(|v| (i, v)));
+        }
+        taken
+    }
+}
+
+/// Takes each shape's displacement at the mesh vertex nearest to each bone's point and each landmark; targets of one shape
+/// add up.
 fn sample_shapes<'a, 's, F>(
     reader: &PrimitiveReader<'a, 's, F>,
     targets: &[Option<ArkitShape>],
     positions: &[Vec3],
-    nearest: &mut [f32],
+    samples: &mut Samples,
     character: &mut Character,
     field: &str,
 ) -> Result<()>
 where
     F: Clone + Fn(gltf::Buffer<'a>) -> Option<&'s [u8]>,
 {
-    // Which bones does this primitive come nearer to than those before it?
-    let mut vertex_of: Vec<(usize, usize)> = Vec::new();
-    for (i, bone) in character.bones.iter().enumerate() {
-        let mut best = None;
-        for (v, position) in positions.iter().enumerate() {
-            let distance = position.distance_squared(bone.rest);
-            if distance < nearest[i] {
-                nearest[i] = distance;
-                best = Some(v);
-            }
-        }
-        vertex_of.extend(best.map(|v| (i, v)));
-    }
+    let num_bones = character.bones.len();
+    let vertex_of = samples.take_nearer(positions);
+    let mut seen = [false; NUM_ARKIT_SHAPES];
     for (t, (displacements, _, _)) in reader.read_morph_targets().enumerate() {
         let Some(shape) = targets.get(t).copied().flatten() else { continue };
         let deltas: Vec<Vec3> = displacements.map(|all| all.map(Vec3::from).collect()).unwrap_or_default();
         let at = match character.shapes.iter().position(|known| known.shape == shape) {
             Some(at) => at,
             None => {
-                let deltas = vec![Vec3::ZERO; character.bones.len()];
-                character.shapes.push(ShapeDeltas { shape, target: t, deltas });
+                let none = |num| vec![Vec3::ZERO; num];
+                character.shapes.push(ShapeDeltas { shape, target: t, deltas: none(num_bones), landmarks: none(character.ibug68.len()) });
                 character.shapes.len() - 1
             }
         };
-        for &(bone, vertex) in &vertex_of {
+        let is_first = !std::mem::replace(&mut seen[shape.index()], true);
+        for &(place, vertex) in &vertex_of {
             let delta = deltas.get(vertex).copied().unwrap_or_default();
             if !delta.is_finite() {
                 return Err(CharacterError::field(format!("{field}.targets[{t}].POSITION[{vertex}]"), "is not finite"));
             }
-            character.shapes[at].deltas[bone] = delta;
+            let shape = &mut character.shapes[at];
+            let sampled = if place < num_bones { &mut shape.deltas[place] } else { &mut shape.landmarks[place - num_bones] };
+            *sampled = if is_first { delta } else { *sampled + delta };
         }
     }
     Ok(())

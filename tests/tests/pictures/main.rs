@@ -5,6 +5,7 @@
 
 mod blood;
 mod golden;
+mod morphs;
 mod probe;
 mod properties;
 mod read_back;
@@ -66,6 +67,7 @@ fn main() -> ExitCode {
         trials.push(trial.with_ignored_flag(stage.is_none()));
     };
     twins::add(&mut add);
+    morphs::add(&mut add);
     skin::add(&mut add);
     blood::add(&mut add);
     zones::add(&mut add);

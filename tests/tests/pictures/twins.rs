@@ -4,7 +4,7 @@ use crate::probe::{PLACE, Probe, Resource, What, run, texture};
 use crate::{Add, Stage};
 use anyhow::{Context, ensure};
 use glam::{Vec2, Vec3, Vec4};
-use rhytid_client::asset::Vertex;
+use rhytid_client::asset::{Morphs, Vertex};
 use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
 use rhytid_client::renderer::{VERTEX_LAYOUT, bone_major, pose_table, uniforms};
 use rhytid_client::twin::{self, WrinkleSample};
@@ -97,7 +97,7 @@ impl Sequence {
 }
 
 /// A frame in which everything moves: brows, jaw, head.
-fn moving_frame(stage: &Stage) -> anyhow::Result<RenderFrame> {
+pub fn moving_frame(stage: &Stage) -> anyhow::Result<RenderFrame> {
     let character = &stage.asset.character;
     let points = posed_points(character, &character.poses[0].name, 0.8, StillSide::Left)?;
     let mut frame = RenderFrame::from(&solve_one(character, TrackingData::Bones { points, head: None })?);
@@ -111,11 +111,12 @@ fn moving_frame(stage: &Stage) -> anyhow::Result<RenderFrame> {
     Ok(frame)
 }
 
-fn all_vertices(stage: &Stage) -> Vec<Vertex> {
+pub fn all_vertices(stage: &Stage) -> Vec<Vertex> {
     stage.asset.primitives.iter().flat_map(|primitive| primitive.vertices.iter().copied()).collect()
 }
 
-fn probe_skinning(
+/// One value a vertex; shapes deform it too where the frame carries weights.
+pub fn probe_skinning(
     stage: &Stage,
     asset: &CharacterAsset,
     frame: &RenderFrame,
@@ -130,17 +131,29 @@ fn probe_skinning(
     let mut coefficients = vec![0_u8; size_of::<uniforms::CoefficientVectors>()];
     coefficients[..size_of_val(vectors.as_slice())].copy_from_slice(bytemuck::cast_slice(&vectors));
     let table = pose_table(asset);
+    let weights = uniforms::MorphWeights::new(frame.shapes.as_ref());
+    let headless = stage.headless()?;
+    let size = asset.morphs.texture_size();
+    let mut texels: Vec<u8> = bytemuck::cast_slice(&asset.morphs.texels).to_vec();
+    texels.resize((size[0] * size[1]) as usize * 8, 0);
+    let deltas = texture(&headless, wgpu::TextureFormat::Rgba16Float, size, &[texels]).create_view(&wgpu::TextureViewDescriptor::default());
     let probe = Probe {
         source: &format!("{}{PLACE}{SKINNING_PROBE}", rhytid_shaders::SKINNING),
         entries: ["vs_probe", "fs_probe"],
         constants: &[("WHICH", f64::from(which)), ("NUM_POSES", character.num_poses() as f64)],
         groups: &[(
             1,
-            &[(0, Resource::Block(&palette)), (1, Resource::Block(&coefficients)), (2, Resource::Block(bytemuck::bytes_of(&table)))],
+            &[
+                (0, Resource::Block(&palette)),
+                (1, Resource::Block(&coefficients)),
+                (2, Resource::Block(bytemuck::bytes_of(&table))),
+                (5, Resource::Texture { view: &deltas, dimension: wgpu::TextureViewDimension::D2, is_filterable: false }),
+                (6, Resource::Block(bytemuck::bytes_of(&weights))),
+            ],
         )],
         what: What::Points { layout: VERTEX_LAYOUT, bytes: bytemuck::cast_slice(vertices), count: vertices.len() },
     };
-    run(&*stage.headless()?, &probe)
+    run(&headless, &probe)
 }
 
 fn skinning(stage: &Stage) -> anyhow::Result<()> {
@@ -187,6 +200,7 @@ fn influences(stage: &Stage) -> anyhow::Result<()> {
             character: Arc::new(character),
             primitives: Vec::new(),
             palette: stage.asset.palette.clone(),
+            morphs: Morphs::default(),
             wrinkles: None,
             zones: None,
             blood: None,
