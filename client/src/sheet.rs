@@ -14,6 +14,8 @@ const AIR: f32 = 7.0;
 const AFTER_CAPTION: f32 = 14.0;
 const BACKGROUND: Color32 = Color32::from_rgb(0x17, 0x18, 0x1b);
 const SLATE: Color32 = Color32::from_rgb(0x24, 0x26, 0x2a);
+/// Bars of what is taken away.
+const NEGATIVE: Color32 = Color32::from_rgb(0x5f, 0x8f, 0xc9);
 /// egui hands its textures to the painter through this format, already encoded for the screen.
 const FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
 /// No sheet is larger, pixels a side: what WebGL2 guarantees is half of it, what draws sheets has more.
@@ -66,7 +68,7 @@ pub(crate) enum Content {
     Bars {
         /// Width and height of the slate, pixels.
         size: [u32; 2],
-        /// A bar's name, its length from 0 to 1, and what stands at its end.
+        /// A bar's name, its length from -1 to 1, and what stands at its end.
         bars: Vec<(String, f32, String)>,
     },
 }
@@ -197,8 +199,8 @@ fn draw_bars(painter: &egui::Painter, at: Rect, bars: &[(String, f32, String)]) 
         painter.text(pos2(at.left() + GAP, y), Align2::LEFT_CENTER, name, font.clone(), TEXT);
         painter.text(pos2(at.right() - GAP, y), Align2::RIGHT_CENTER, end, font.clone(), TEXT);
         let (left, right) = (at.left() + 0.46 * at.width(), at.right() - 0.16 * at.width());
-        let bar = Rect::from_min_max(pos2(left, y - 0.28 * step), pos2(left + (right - left) * length.clamp(0.0, 1.0), y + 0.28 * step));
-        painter.rect_filled(bar, CornerRadius::same(2), ACCENT);
+        let bar = Rect::from_min_max(pos2(left, y - 0.28 * step), pos2(left + (right - left) * length.abs().min(1.0), y + 0.28 * step));
+        painter.rect_filled(bar, CornerRadius::same(2), if *length < 0.0 { NEGATIVE } else { ACCENT });
     }
 }
 

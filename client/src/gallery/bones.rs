@@ -143,15 +143,12 @@ pub(super) fn poses(easel: &mut Easel) -> Result<Sheet> {
     for pose in &character.poses {
         faces.push((pose.name.clone(), easel.posed(posed_points(&character, &pose.name, 1.0, StillSide::Both)?)?));
     }
-    if let (Some(a), Some(b)) = (character.poses.first(), character.poses.get(1)) {
-        // Two poses that move the same bones, one over the other.
-        const SHARE: f32 = 0.6;
-        let points = character.bones.iter().enumerate().filter_map(|(i, bone)| {
-            let point = bone.rest + SHARE * (a.points[i] - bone.rest) + SHARE * (b.points[i] - bone.rest);
-            (point != bone.rest).then_some((i, point))
-        });
-        faces.push((format!("{} and {} together", a.name, b.name), easel.posed(points.collect())?));
-    }
+    // Two poses in one area, as in the paper's last column: the inner brows rise, the outer ones do not.
+    let inner = |(bone, _): &(usize, glam::Vec3)| character.bones[*bone].name.starts_with("brow_inner");
+    let mut points: Vec<_> =
+        posed_points(&character, "compress", 0.8, StillSide::Both)?.into_iter().filter(|moved| !inner(moved)).collect();
+    points.extend(posed_points(&character, "stretch", 0.8, StillSide::Both)?.into_iter().filter(inner));
+    faces.push(("inner brows of stretch, all else of compress".into(), easel.posed(points)?));
     let mut rows = vec![Row::default(), Row::default(), Row::default()];
     for (name, frame) in &faces {
         for (row, view) in rows.iter_mut().zip([ViewMode::Bare, ViewMode::Influence(None), ViewMode::Beauty]) {

@@ -20,8 +20,8 @@ pub(super) const JOY: Expression = Expression {
         ("mouthDimpleRight", 0.2),
         ("eyeSquintLeft", 0.3),
         ("eyeSquintRight", 0.3),
-        ("browOuterUpLeft", 0.2),
-        ("browOuterUpRight", 0.2),
+        ("browOuterUpLeft", 0.45),
+        ("browOuterUpRight", 0.45),
     ],
 };
 

@@ -1,13 +1,12 @@
 //! The figures of Jimenez, Echevarria, Oat, Gutierrez 2011 that show faces: wrinkles in zones, driven by expressions.
 
 use super::Result;
-use super::easel::{Amounts, Easel};
+use super::easel::Easel;
 use super::expressions::{self, ANGER, COMPLEX, DISGUST, Expression, JOY, SURPRISE};
 use crate::render_cli::PictureError;
 use crate::renderer::{DrawSettings, RenderFrame, Studio, ViewMode, WrinkleSystem};
 use crate::sheet::{Cell, Content, Row, Sheet};
 use glam::Vec3;
-use image::RgbaImage;
 
 fn zones_only(settings: DrawSettings) -> DrawSettings {
     DrawSettings { system: WrinkleSystem::Zones, ..settings }
@@ -26,13 +25,18 @@ fn mixed(a: (&Expression, f32), b: (&Expression, f32)) -> (Vec<(&'static str, f3
 
 /// Figure 1.1.
 pub(super) fn with_and_without(easel: &mut Easel) -> Result<Sheet> {
-    const SIZE: [u32; 2] = [640, 640];
-    let frame = whole(easel, &DISGUST)?;
-    let mut row = Row::default();
-    for (view, caption) in [(ViewMode::Bare, "without wrinkles"), (ViewMode::Beauty, "with the wrinkles of its zones")] {
-        row.cells.push(Cell::new(easel.draw(SIZE, &zones_only(DrawSettings { view, ..easel.face() }), &frame)?, caption));
+    const SIZE: [u32; 2] = [560, 560];
+    let mut rows = Vec::new();
+    for expression in [&SURPRISE, &DISGUST] {
+        let frame = whole(easel, expression)?;
+        let mut row = Row::default();
+        for (view, what) in [(ViewMode::Bare, "without wrinkles"), (ViewMode::Beauty, "with the wrinkles of its zones")] {
+            let picture = easel.draw(SIZE, &zones_only(DrawSettings { view, ..easel.face() }), &frame)?;
+            row.cells.push(Cell::new(picture, format!("{}, {what}", expression.name)));
+        }
+        rows.push(row);
     }
-    Ok(Sheet { title: "Jimenez et al. 2011, Figure 1.1".into(), subtitle: "disgust".into(), rows: vec![row] })
+    Ok(Sheet { title: "Jimenez et al. 2011, Figure 1.1".into(), subtitle: "the same face without and with wrinkles".into(), rows })
 }
 
 /// Figure 1.2.
@@ -188,9 +192,8 @@ pub(super) fn both_papers(easel: &mut Easel) -> Result<Sheet> {
 
 /// Seven emotions under each set-up of lights.
 pub(super) fn emotions(easel: &mut Easel) -> Result<Sheet> {
-    const SIZE: [u32; 2] = [300, 300];
-    let smile: &Amounts = JOY.weights;
-    let mut faces = vec![("neutral", RenderFrame::at_rest(easel.character())), ("smile", easel.expression(smile, &[("joy", 0.6)])?)];
+    const SIZE: [u32; 2] = [340, 340];
+    let mut faces = vec![("neutral", RenderFrame::at_rest(easel.character())), ("smile", easel.expression(JOY.weights, &[("joy", 0.6)])?)];
     for expression in [SURPRISE, ANGER, DISGUST, expressions::FEAR, expressions::SAD] {
         faces.push((expression.name, whole(easel, &expression)?));
     }
@@ -198,9 +201,8 @@ pub(super) fn emotions(easel: &mut Easel) -> Result<Sheet> {
     for studio in [Studio::Portrait, Studio::Sunset] {
         let mut row = Row { heading: format!("{studio}"), cells: Vec::new() };
         for (name, frame) in &faces {
-            let settings = DrawSettings { studio, system: WrinkleSystem::Own, ..easel.face() };
-            let picture: RgbaImage = easel.draw(SIZE, &settings, frame)?;
-            row.cells.push(Cell::new(picture, *name));
+            let settings = DrawSettings { studio, system: WrinkleSystem::Both, ..easel.face() };
+            row.cells.push(Cell::new(easel.draw(SIZE, &settings, frame)?, *name));
         }
         rows.push(row);
     }

@@ -1,15 +1,20 @@
 //! Wrinkle zones on the device against their twin, and what they cost.
 
+use crate::golden::{Lens, camera};
 use crate::probe::{PLACE, Probe, Resource, What, run, texture};
 use crate::twins::Sequence;
 use crate::{Add, Stage};
-use anyhow::ensure;
+use anyhow::{Context, ensure};
 use glam::{Vec2, Vec3, Vec4};
+use image::{Rgba, RgbaImage};
 use rhytid_client::asset::{MipChain, Texels, ZoneMaps};
-use rhytid_client::renderer::{AdapterChoice, ZoneBlend, uniforms};
+use rhytid_client::renderer::{AdapterChoice, WrinkleSystem, ZoneBlend, uniforms};
 use rhytid_client::twin::{self, zones::ZoneSample};
-use rhytid_client::{CharacterAsset, Headless};
-use rhytid_shared::DEFAULT_CHARACTER_GLB;
+use rhytid_client::{CharacterAsset, DrawSettings, Headless, RenderFrame, ViewMode};
+use rhytid_server::solve::{SolveConfig, Solver};
+use rhytid_shared::limits::MAX_EXPRESSIONS;
+use rhytid_shared::{DEFAULT_CHARACTER_GLB, FaceFrame, PublishHello, TrackingData, TrackingFrame};
+use std::sync::Arc;
 
 const PROBE: &str = "
 struct Case { @location(0) uv: vec2<f32> }
@@ -25,11 +30,14 @@ struct Out { @builtin(position) at: vec4<f32>, @location(0) @interpolate(flat, e
 ";
 const SIDE: usize = 16;
 const BASE_SCALE: f32 = 0.5;
+/// Side of a picture of the forehead, pixels.
+const PICTURE: u32 = 256;
 
 pub fn add(add: &mut Add<'_>) {
     for blend in ZoneBlend::ALL {
         add(format!("zones::blend_{blend}"), Box::new(move |stage| blended(stage, *blend)));
     }
+    add("zones::anger_takes_back_the_forehead_s_wrinkles_of_surprise".into(), Box::new(opposed));
     add("zones::masks_and_map_fit_the_paper_s_96_kilobytes".into(), Box::new(bytes));
 }
 
@@ -114,6 +122,63 @@ fn blended(stage: &Stage, blend: ZoneBlend) -> anyhow::Result<()> {
         num_apart += usize::from(Vec4::from(other[i]).truncate().distance(normal) > 5e-3);
     }
     ensure!(num_apart > SIDE * SIDE / 2, "{blend} differs from another blend at {num_apart} places only");
+    Ok(())
+}
+
+/// The face at rest, wrinkled by expressions alone.
+fn expressed(stage: &Stage, expressions: &[(&str, f32)]) -> anyhow::Result<RenderFrame> {
+    let character = &stage.asset.character;
+    let zones = character.zones.as_ref().context("the built-in character has zones")?;
+    let mut amounts = [0.0; MAX_EXPRESSIONS];
+    for (name, amount) in expressions {
+        let row = zones.expressions.iter().position(|row| row.name == *name).context("the table has this expression")?;
+        amounts[row] = *amount;
+    }
+    let data = TrackingData::Bones { points: Vec::new(), head: None };
+    let tracked = TrackingFrame { expressions: Some(amounts), ..TrackingFrame::new(0.0, data) };
+    let hello = PublishHello { source: "test".into(), fps: None, layout: None, image: None, focal: None, takeover: false };
+    let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
+    let mut solved = FaceFrame::at_rest(character);
+    solver.solve(&tracked, &mut solved)?;
+    Ok(RenderFrame::from(&solved))
+}
+
+/// Figure 1.5: negative weights cancel positive ones, and the forehead smooths out.
+fn opposed(stage: &Stage) -> anyhow::Result<()> {
+    let character = &stage.asset.character;
+    let camera = camera(character, Lens::Forehead);
+    let settings = DrawSettings { view: ViewMode::Normals, system: WrinkleSystem::Zones, ..DrawSettings::new(camera) };
+    let mut headless = stage.headless()?;
+    let mut normals = |frame: &RenderFrame| headless.render([PICTURE; 2], &settings, frame);
+    let rest = normals(&RenderFrame::at_rest(character))?;
+    // Nothing but the forehead's zones, which are the first four: where they show is the forehead. Between the brows the
+    // zones overlap with those of anger's own lines.
+    let (mut forehead, mut below) = (RenderFrame::at_rest(character), RenderFrame::at_rest(character));
+    forehead.zones[..4].fill(1.0);
+    below.zones[4..].fill(1.0);
+    let squared = |a: &Rgba<u8>, b: &Rgba<u8>| (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum::<f64>();
+    let (forehead, below) = (normals(&forehead)?, normals(&below)?);
+    let region: Vec<bool> = (0..PICTURE * PICTURE)
+        .map(|i| {
+            let at = |picture: &RgbaImage| squared(picture.get_pixel(i % PICTURE, i / PICTURE), rest.get_pixel(i % PICTURE, i / PICTURE));
+            at(&forehead) > 16.0 && at(&below) < 4.0
+        })
+        .collect();
+    let num_pixels = region.iter().filter(|is_in| **is_in).count();
+    ensure!(num_pixels > 2000, "the forehead's zones show in {num_pixels} pixels");
+    let mut energy = |expressions: &[(&str, f32)]| -> anyhow::Result<f64> {
+        let picture = normals(&expressed(stage, expressions)?)?;
+        let pixels = picture.pixels().zip(rest.pixels()).zip(&region);
+        Ok(pixels.filter(|(_, is_in)| **is_in).map(|((a, b), _)| squared(a, b)).sum())
+    };
+    let surprise = energy(&[("surprise", 1.0)])?;
+    let with_anger = energy(&[("surprise", 1.0), ("anger", 1.0)])?;
+    let with_little_anger = energy(&[("surprise", 1.0), ("anger", 0.25)])?;
+    ensure!(with_anger <= 0.3 * surprise, "energy {with_anger:.0} of surprise and anger, {surprise:.0} of surprise alone");
+    ensure!(
+        with_little_anger > 0.3 * surprise,
+        "energy {with_little_anger:.0} of surprise and a little anger, {surprise:.0} of surprise alone"
+    );
     Ok(())
 }
 
