@@ -108,7 +108,15 @@ impl Easel {
             }
             tracked.expressions = Some(amounts);
         }
-        let hello = PublishHello { source: "gallery".into(), fps: None, layout: None, image: None, focal: None, takeover: false, keep_neutral: false };
+        let hello = PublishHello {
+            source: "gallery".into(),
+            fps: None,
+            layout: None,
+            image: None,
+            focal: None,
+            takeover: false,
+            keep_neutral: false,
+        };
         let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
         let mut solved = FaceFrame::at_rest(character);
         solver.solve(&tracked, &mut solved)?;

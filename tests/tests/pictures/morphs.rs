@@ -95,6 +95,7 @@ fn full_texture(stage: &Stage) -> anyhow::Result<()> {
         palette: stage.asset.palette.clone(),
         morphs: Morphs { texels },
         wrinkles: None,
+        blood: None,
         zones: None,
     };
     let frame = RenderFrame { shapes: Some([0.7; NUM_ARKIT_SHAPES]), ..RenderFrame::at_rest(&asset.character) };

@@ -136,7 +136,8 @@ fn expressed(stage: &Stage, expressions: &[(&str, f32)]) -> anyhow::Result<Rende
     }
     let data = TrackingData::Bones { points: Vec::new(), head: None };
     let tracked = TrackingFrame { expressions: Some(amounts), ..TrackingFrame::new(0.0, data) };
-    let hello = PublishHello { source: "test".into(), fps: None, layout: None, image: None, focal: None, takeover: false };
+    let hello =
+        PublishHello { source: "test".into(), fps: None, layout: None, image: None, focal: None, takeover: false, keep_neutral: false };
     let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
     let mut solved = FaceFrame::at_rest(character);
     solver.solve(&tracked, &mut solved)?;
