@@ -47,6 +47,12 @@ pub enum PlayoutState {
     Idle,
 }
 
+impl PlayoutState {
+    fn is_eased(self) -> bool {
+        matches!(self, Self::Silent | Self::Idle)
+    }
+}
+
 /// What became of a frame given to [`Playout::push`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pushed {
@@ -127,6 +133,19 @@ struct Blend {
     from: RenderFrame,
     started_at: i64,
     length: i64,
+}
+
+impl Blend {
+    /// How much of what shall be shown is shown at `now`, in `[0, 1]`.
+    fn share(&self, now: i64) -> f32 {
+        smoothstep(((now - self.started_at) as f32 / self.length as f32).clamp(0.0, 1.0))
+    }
+
+    /// How far the face shown at `now` is at most behind what shall be shown, microseconds. At the start it was half the
+    /// length (see [`Playout::sample`]); what shall be shown has moved on since.
+    fn behind(&self, now: i64) -> i64 {
+        ((1.0 - self.share(now)) * (self.length / 2 + now - self.started_at) as f32) as i64
+    }
 }
 
 impl Playout {
@@ -216,14 +235,21 @@ impl Playout {
         match &mut self.session {
             None => self.wanted.clone_from(&self.rest),
             Some(session) => {
-                session.clock.advance(now);
-                let underrun_before = session.underrun;
+                let passed = session.clock.advance(now);
+                let (underrun_before, state_before) = (session.underrun, self.state);
                 self.state = session.sample(session.clock.play_time(now), now, &self.rest, &mut self.wanted);
+                let missed = underrun_before - session.underrun;
                 if session.clock.take_jump() {
                     blend_length = Some(MAX_BLEND);
-                } else if underrun_before > 0 && session.underrun < underrun_before {
-                    // Twice the time that was missed: the face is never faster than one and a half times life.
-                    blend_length = Some(2 * underrun_before);
+                } else if underrun_before > 0 && state_before.is_eased() && !self.state.is_eased() {
+                    blend_length = Some(EASE.as_micros() as i64);
+                } else if 2 * missed > passed {
+                    // Twice the time that the face is behind: it catches up at one and a half times life, on average. That
+                    // includes what a blend cut short here still had to make up for, or a short gap after a long one would
+                    // hurry the face through both. Less than half of the time since the last picture is no faster than that
+                    // as it is; a blend begun anew for every little that evenly late frames gain would hold the face.
+                    let behind = self.blend.as_ref().map_or(0, |blend| blend.behind(now));
+                    blend_length = Some(2 * (missed + behind));
                 } else if underrun_before == 0 && session.underrun > 0 {
                     self.stats.underruns += 1;
                 }
@@ -234,8 +260,7 @@ impl Playout {
         }
         match &self.blend {
             Some(blend) if now < blend.started_at + blend.length => {
-                let u = smoothstep((now - blend.started_at) as f32 / blend.length as f32);
-                mix::mix(&blend.from, &self.wanted, u, &mut self.shown);
+                mix::mix(&blend.from, &self.wanted, blend.share(now), &mut self.shown);
             }
             _ => {
                 self.blend = None;

@@ -56,6 +56,30 @@ pub enum PictureError {
         /// What the solve said.
         source: SolveError,
     },
+    /// A file holds no neutral face.
+    #[error("{path} holds no neutral face: {source}")]
+    Calibration {
+        /// The file.
+        path: String,
+        /// What was read instead.
+        source: serde_json::Error,
+    },
+    /// A neutral face is not one for this feed.
+    #[error("{path} is of another feed or damaged: {source}")]
+    Unfit {
+        /// The file.
+        path: String,
+        /// What the solve said.
+        source: SolveError,
+    },
+    /// There is no neutral face to write.
+    #[error("{feed} came to no neutral face, nothing to write to {path}")]
+    NoNeutral {
+        /// The feed.
+        feed: String,
+        /// The file.
+        path: String,
+    },
     /// A pose given on the command line was refused.
     #[error(transparent)]
     Solve(#[from] SolveError),
@@ -135,6 +159,12 @@ pub struct RenderArgs {
     /// Stop after this many pictures
     #[arg(long)]
     pub limit: Option<usize>,
+    /// Start from the neutral face that --save-calibration wrote instead of searching for one
+    #[arg(long, value_name = "FILE.json")]
+    pub calibration: Option<PathBuf>,
+    /// Write the neutral face that the feed came to
+    #[arg(long, value_name = "FILE.json")]
+    pub save_calibration: Option<PathBuf>,
     /// Picture
     #[command(flatten)]
     pub picture: PictureArgs,
@@ -222,7 +252,10 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
     let path = args.feed.display().to_string();
     let num_frames = count_frames(&args.feed)?;
     let mut feed = Feed::open(&args.feed, &character)?;
-    let mut solver = Solver::new(Arc::clone(&character), &SolveConfig::default(), &feed.hello)?;
+    let mut solver = match &args.calibration {
+        Some(path) => start_calibrated(&character, &feed.hello, path)?,
+        None => Solver::new(Arc::clone(&character), &SolveConfig::default(), &feed.hello)?,
+    };
     std::fs::create_dir_all(&args.out).map_err(|source| PictureError::Io { path: args.out.display().to_string(), source })?;
 
     let progress = progress_bar(num_frames);
@@ -251,7 +284,31 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
         }
     }
     progress.finish_and_clear();
+    if let Some(path) = &args.save_calibration {
+        save_calibration(&solver, &args.feed, path)?;
+    }
     Ok(num_written)
+}
+
+/// A solver that starts from the neutral face in the file at `path`.
+fn start_calibrated(character: &Arc<Character>, hello: &PublishHello, path: &Path) -> Result<Solver> {
+    let shown = path.display().to_string();
+    let text = std::fs::read(path).map_err(|source| PictureError::Io { path: shown.clone(), source })?;
+    let calibration = serde_json::from_slice(&text).map_err(|source| PictureError::Calibration { path: shown.clone(), source })?;
+    // What is wrong with the hello is no fault of the file.
+    Solver::new(Arc::clone(character), &SolveConfig::default(), hello)?;
+    Solver::with_calibration(Arc::clone(character), &SolveConfig::default(), hello, calibration)
+        .map_err(|source| PictureError::Unfit { path: shown, source })
+}
+
+/// Writes the neutral face in use to the file at `path`.
+fn save_calibration(solver: &Solver, feed: &Path, path: &Path) -> Result<()> {
+    let shown = path.display().to_string();
+    let Some(calibration) = solver.calibration() else {
+        return Err(PictureError::NoNeutral { feed: feed.display().to_string(), path: shown });
+    };
+    let text = serde_json::to_string_pretty(calibration).map_err(|source| PictureError::Calibration { path: shown.clone(), source })?;
+    std::fs::write(path, text + "\n").map_err(|source| PictureError::Io { path: shown, source })
 }
 
 /// Draws one picture of a pose, through the same solve as everything else.
@@ -277,7 +334,7 @@ pub fn still(args: &StillArgs) -> Result<()> {
 
 /// One frame by itself, as the first of a session.
 pub fn solve_one(character: &Arc<Character>, data: TrackingData) -> std::result::Result<FaceFrame, SolveError> {
-    let hello = PublishHello { source: "still".into(), fps: None, layout: None, image: None, focal: None, takeover: false };
+    let hello = PublishHello { source: "still".into(), ..PublishHello::default() };
     let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
     let mut solved = FaceFrame::at_rest(character);
     solver.solve(&TrackingFrame::new(0.0, data), &mut solved)?;

@@ -139,6 +139,8 @@ pub struct Renderer {
     frame_group_unlit: wgpu::BindGroup,
     presenter: Presenter,
     targets: Option<Targets>,
+    /// Some zone of the picture being drawn is stretched.
+    is_stretched: bool,
     /// Of the picture being drawn, pixels.
     height: u32,
     /// Pictures so far: the grain changes with it.
@@ -209,6 +211,7 @@ impl Renderer {
             frame_group_unlit,
             presenter: Presenter::new(device, target_format),
             targets: None,
+            is_stretched: false,
             height: 1,
             num_drawn: 0,
             num_draws: 0,
@@ -305,6 +308,7 @@ impl Renderer {
         if let Some(scales) = &self.zone_scales {
             let fade = settings.camera.wrinkle_fade(scales.wavelength, size[1]) * f32::from(u8::from(settings.wrinkles));
             let weights = scales.weights(frame, settings.zone_blend, fade);
+            self.is_stretched = weights.stretched != [[0.0; 4]; 2];
             queue.write_buffer(&self.group.zone_weights, 0, bytemuck::bytes_of(&weights));
         }
         queue.write_buffer(&self.group.coefficients, 0, bytemuck::cast_slice(&coefficients));
@@ -470,7 +474,8 @@ impl Renderer {
         pass.set_bind_group(1, &self.group.group, &[]);
         let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
         let (has_bones, has_zones) = self.systems(settings);
-        let has_stretch = self.zone_scales.as_ref().is_some_and(ZoneScales::has_stretch);
+        // A map that nothing shows is not read.
+        let has_stretch = self.is_stretched;
         let zones = (if has_zones { settings.zone_blend.number() } else { 0 }, has_stretch);
         // What adds to or covers the rest comes last.
         let rank = |surface: Surface| match surface {
@@ -488,7 +493,14 @@ impl Renderer {
                 pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
                 for region in &primitive.regions {
                     let poses = if has_bones { region.poses } else { 0 };
-                    let key = Key::new(look, primitive.surface, primitive.is_double_sided, primitive.alpha, poses, zones);
+                    let key = Key::new(
+                        look,
+                        primitive.surface,
+                        primitive.is_double_sided,
+                        primitive.alpha,
+                        poses,
+                        if region.has_zones { zones } else { (0, false) },
+                    );
                     pass.set_pipeline(self.pipelines.surface(device, key));
                     pass.draw_indexed(region.indices.clone(), 0, 0..1);
                     self.num_draws += 1;

@@ -14,6 +14,8 @@ fn main() {
         drawn("limit_ends_after_so_many_pictures", limit_ends_after_so_many_pictures),
         drawn("views_show_different_things", views_show_different_things),
         drawn("two_processes_draw_the_same_bytes", two_processes_draw_the_same_bytes),
+        drawn("a_neutral_is_kept_and_used_again", a_neutral_is_kept_and_used_again),
+        drawn("what_is_no_neutral_for_the_feed_is_refused", what_is_no_neutral_for_the_feed_is_refused),
         drawn("bad_line_ends_it_and_is_named", bad_line_ends_it_and_is_named),
         drawn("still_draws_the_pose_it_is_asked_for", still_draws_the_pose_it_is_asked_for),
         drawn("unknown_names_are_refused_with_those_there_are", unknown_names_are_refused_with_those_there_are),
@@ -130,6 +132,56 @@ fn two_processes_draw_the_same_bytes() -> Result<(), Failed> {
         let (a, b) = (std::fs::read(out.join("a").join(&name))?, std::fs::read(out.join("b").join(&name))?);
         assert!(a == b, "{name} differs between two runs");
     }
+    Ok(())
+}
+
+/// The built-in session, whose neutral is searched for.
+fn landmarks() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/assets/demo.ibug68.jsonl")
+}
+
+fn a_neutral_is_kept_and_used_again() -> Result<(), Failed> {
+    let out = folder("neutral");
+    let path = |name: &str| out.join(name).display().to_string();
+    check(&render(&landmarks(), &out.join("a"), &["--every", "1000", "--save-calibration", &path("a.json")])?)?;
+    // One frame comes to no neutral: the one given is in use, to the last bit.
+    let again = ["--limit", "1", "--calibration", &path("a.json"), "--save-calibration", &path("b.json")];
+    check(&render(&landmarks(), &out.join("b"), &again)?)?;
+    assert!(std::fs::read(path("a.json"))? == std::fs::read(path("b.json"))?, "a neutral survives the file");
+    let (a, b) = (std::fs::read(out.join("a/00000.png"))?, std::fs::read(out.join("b/00000.png"))?);
+    assert!(a != b, "with the neutral known the first face is not taken for one");
+    let output = render(&landmarks(), &out.join("c"), &["--limit", "1", "--save-calibration", &path("c.json")])?;
+    let said = stderr(&output);
+    assert!(output.status.code() == Some(1) && said.contains("demo.ibug68.jsonl came to no neutral face"), "{said}");
+    Ok(())
+}
+
+fn what_is_no_neutral_for_the_feed_is_refused() -> Result<(), Failed> {
+    let out = folder("no_neutral");
+    let neutral = |num_points: usize| {
+        let points = vec!["[0,0,0]"; num_points].join(",");
+        format!(
+            r#"{{"t":1,"num_frames":9,"speed":0,"requested":false,"points":[{points}],"head_rotation":[0,0,0,1],"head_position":[0,0,1],"weights":null}}"#
+        )
+    };
+    for (name, text, parts) in [
+        ("none.json", None, ["none.json", "o such file"]),
+        ("text.json", Some("neutral".to_owned()), ["text.json holds no neutral face", "line 1"]),
+        ("other.json", Some(r#"{"t":1}"#.to_owned()), ["other.json holds no neutral face", "missing field `num_frames`"]),
+        ("few.json", Some(neutral(67)), ["few.json is of another feed", "has 67 points, expected 68"]),
+        ("flat.json", Some(neutral(68)), ["flat.json is of another feed", "do not span a face"]),
+    ] {
+        let path = out.join(name);
+        if let Some(text) = text {
+            std::fs::write(&path, text)?;
+        }
+        let output = render(&landmarks(), &out.join("pictures"), &["--calibration", &path.display().to_string()])?;
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert_eq!(said.trim_end().lines().count(), 1, "{said}");
+        assert!(parts.iter().all(|part| said.contains(part)), "{said:?} lacks one of {parts:?}");
+    }
+    assert!(!out.join("pictures").exists(), "nothing is left behind");
     Ok(())
 }
 

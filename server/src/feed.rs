@@ -75,7 +75,7 @@ impl<R: BufRead> Feed<R> {
     }
 
     fn begin(lines: R, path: String, reader: PublishReader) -> Result<Self, FeedError> {
-        let mut hello = PublishHello { source: String::new(), fps: None, layout: None, image: None, focal: None, takeover: false };
+        let mut hello = PublishHello::default();
         let mut feed = Self { hello: hello.clone(), path, line: 0, text: String::new(), lines, reader };
         if feed.next_line()? {
             match feed.read(&mut TrackingFrame::default())? {

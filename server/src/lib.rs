@@ -20,7 +20,7 @@ pub mod solve;
 mod stream;
 mod viewer;
 
-pub use clip::{Clip, ClipError, ClipReader, clip_feed};
+pub use clip::{Clip, ClipError, ClipReader};
 pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts};
 pub use send::{SendError, SendOptions, SendReport, SendSource, send};
 pub use service::{ServerError, bind, load_character, run};

@@ -3,12 +3,11 @@
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
-use rhytid_server::{
-    Access, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, bind, clip_feed, load_character, run, send,
-};
+use rhytid_server::{Access, Clip, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, bind, load_character, run, send};
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Duration;
 use tracing_subscriber::EnvFilter;
 
@@ -233,7 +232,7 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         (None, clip) => {
             let name = clip.context("expected a feed file or --clip")?;
             let (character, glb) = load_character(args.character.as_deref())?;
-            SendSource::Text(clip_feed(&glb, &character, &name)?, format!("clip {name}"))
+            SendSource::Clip(Arc::new(Clip::open(&glb, &character, &name)?), format!("clip {name}"))
         }
     };
     let progress = ProgressBar::new(0);

@@ -5,7 +5,7 @@ use crate::pipeline::Pipeline;
 use crate::room::{Evicted, Publishing, RoomError};
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
-use crate::solve::DelayReport;
+use crate::solve::{Calibration, DelayReport, SolveError};
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
 use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
@@ -28,6 +28,8 @@ enum Answer<'a> {
         room: &'a str,
         /// Number of this session in its room.
         session: u32,
+        /// True where the session starts from the neutral face that the room has kept.
+        kept_neutral: bool,
         character: &'a str,
         /// Names that `bones` frames may use.
         bones: Vec<&'a str>,
@@ -83,24 +85,36 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infa
         },
     };
     // Before the room is claimed: a hello that leads to nothing takes no room from anybody.
-    let mut pipeline = Pipeline::new(hub.character.clone(), &hub.config.solve, &hello, 0)
-        .map_err(|error| refusal("bad_hello", format!("hello: {error}")))?;
+    let kept = hello.keep_neutral.then(|| hub.rooms.neutral(room, &hello)).flatten();
+    let (mut pipeline, has_kept) = start(hub, &hello, kept).map_err(|error| refusal("bad_hello", format!("hello: {error}")))?;
     let (place, evicted) = claim(hub, room, &hello)?;
     pipeline.set_session(place.session);
-    tracing::info!(%room, session = place.session, source = hello.source, takeover = hello.takeover, "publisher ready");
+    tracing::info!(%room, session = place.session, source = hello.source, takeover = hello.takeover, has_kept, "publisher ready");
     let heard = Heard::now();
-    let mut session = Session::new(hub, place, pipeline, reader);
+    let mut session = Session::new(hub, place, pipeline, reader, hello);
     let stop = tokio::select! {
         biased;
         () = stopped(&mut shutdown) => Ending::shutdown().into(),
         _ = evicted => taken_over(),
-        result = session.run(socket, &heard) => match result { Err(stop) => stop },
+        result = session.run(socket, &heard, has_kept) => match result { Err(stop) => stop },
         () = heard.silence(seconds(timeouts.publisher_idle)) => {
             refusal("idle", format!("nothing heard for {} seconds", timeouts.publisher_idle))
         }
     };
+    // What has refined the neutral since it was told of.
+    session.keep_neutral();
     tracing::info!(%room, session = session.place.session, frames = session.num_frames, "publisher gone");
     Err(stop)
+}
+
+/// The session's pipeline, and whether it starts from the `kept` neutral face.
+fn start(hub: &Hub, hello: &PublishHello, kept: Option<Calibration>) -> Result<(Pipeline, bool), SolveError> {
+    let (character, config) = (&hub.character, &hub.config.solve);
+    // A neutral of weights does not fit a sender that has a layout too: its landmarks have none yet.
+    if let Some(pipeline) = kept.and_then(|kept| Pipeline::with_calibration(character.clone(), config, hello, 0, kept).ok()) {
+        return Ok((pipeline, true));
+    }
+    Ok((Pipeline::new(character.clone(), config, hello, 0)?, false))
 }
 
 /// Reads up to the hello.
@@ -120,6 +134,7 @@ struct Session<'a> {
     place: Publishing,
     pipeline: Pipeline,
     reader: PublishReader,
+    hello: PublishHello,
     frame: TrackingFrame,
     packet: Vec<u8>,
     messages: Rate,
@@ -131,13 +146,14 @@ struct Session<'a> {
 }
 
 impl<'a> Session<'a> {
-    fn new(hub: &'a Hub, place: Publishing, pipeline: Pipeline, reader: PublishReader) -> Self {
+    fn new(hub: &'a Hub, place: Publishing, pipeline: Pipeline, reader: PublishReader, hello: PublishHello) -> Self {
         let now = Instant::now();
         Self {
             hub,
             place,
             pipeline,
             reader,
+            hello,
             frame: TrackingFrame::default(),
             packet: Vec::new(),
             messages: Rate::new(hub.config.limits.frames_per_second, now),
@@ -149,12 +165,13 @@ impl<'a> Session<'a> {
     }
 
     /// Says that it is ready and takes messages until the session ends. May be dropped at any await.
-    async fn run(&mut self, socket: &mut Socket, heard: &Heard) -> Result<Infallible, Stop> {
+    async fn run(&mut self, socket: &mut Socket, heard: &Heard, kept_neutral: bool) -> Result<Infallible, Stop> {
         let character = &self.hub.character;
         let ready = Answer::Ready {
             version: PROTOCOL_VERSION,
             room: self.place.room.name.as_str(),
             session: self.place.session,
+            kept_neutral,
             character: &character.name,
             bones: character.bones.iter().map(|bone| bone.name.as_str()).collect(),
         };
@@ -219,6 +236,7 @@ impl<'a> Session<'a> {
             Err(error) => return self.refuse(socket, ErrorMessage::new(error.code, error.message)).await,
         }
         if let Some(report) = self.pipeline.take_calibrated() {
+            self.keep_neutral();
             let answer = Answer::Calibrated {
                 t: report.t,
                 frames: report.num_frames,
@@ -228,6 +246,13 @@ impl<'a> Session<'a> {
             send_json(socket, &answer, seconds(self.hub.config.timeouts.write)).await?;
         }
         Ok(())
+    }
+
+    /// Leaves the neutral in use with the room.
+    fn keep_neutral(&self) {
+        if let Some(calibration) = self.pipeline.calibration() {
+            self.place.keep_neutral(&self.hello, calibration);
+        }
     }
 
     /// Slows a sender that is too fast, whatever it sends: nothing is read meanwhile, so its own socket fills up. Its frames

@@ -1,9 +1,10 @@
 //! Rooms: where one publisher's packets meet any number of viewers. A room holds one state, the newest; nothing queues.
 
 use crate::metrics::Metrics;
+use crate::solve::Calibration;
 use rhytid_shared::packet::{Decoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
-use rhytid_shared::{FaceFrame, RoomName};
+use rhytid_shared::{FaceFrame, PublishHello, RoomName};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
@@ -90,7 +91,16 @@ struct RoomState {
     key: Option<Arc<KeyPacket>>,
     /// What the listing shows of the newest frame.
     shown: Option<(u32, u64, bool)>,
+    neutral: Option<Neutral>,
     empty_since: Instant,
+}
+
+/// The neutral face that a session came to: kept so that a publisher which comes back need not be searched again.
+struct Neutral {
+    session: u32,
+    /// Whose it is.
+    hello: PublishHello,
+    calibration: Calibration,
 }
 
 struct Publisher {
@@ -109,6 +119,8 @@ pub(crate) struct RoomListing {
     session: u32,
     publisher: Option<PublisherListing>,
     frame: Option<FrameListing>,
+    /// The neutral face that the room keeps.
+    neutral: Option<NeutralListing>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -122,6 +134,17 @@ struct FrameListing {
     seq: u32,
     t: f64,
     face: bool,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct NeutralListing {
+    /// The session that came to it, and the time on its sender's clock, seconds.
+    session: u32,
+    t: f64,
+    /// Frames it is the median of.
+    num_frames: usize,
+    /// The publisher asked for it.
+    requested: bool,
 }
 
 /// A lock that a panicking holder left is still whole: every change under it is complete at each step.
@@ -188,6 +211,7 @@ impl Rooms {
                 num_states: 0,
                 key: None,
                 shown: None,
+                neutral: None,
                 empty_since: Instant::now(),
             }),
             metrics: self.metrics.clone(),
@@ -195,6 +219,13 @@ impl Rooms {
         by_name.insert(name.clone(), room.clone());
         self.metrics.rooms.set(by_name.len() as i64);
         Ok(room)
+    }
+
+    /// The neutral face that the room keeps of the tracker of `hello`.
+    pub fn neutral(&self, name: &RoomName, hello: &PublishHello) -> Option<Calibration> {
+        let room = lock(&self.by_name).get(name).cloned()?;
+        let state = lock(&room.state);
+        state.neutral.as_ref().filter(|kept| kept.hello.is_of_same_tracker(hello)).map(|kept| kept.calibration.clone())
     }
 
     /// Removes rooms that have been without publisher and viewers for `idle`.
@@ -226,6 +257,12 @@ impl Room {
                 .as_ref()
                 .map(|publisher| PublisherListing { source: publisher.source.clone(), seconds: publisher.since.elapsed().as_secs_f64() }),
             frame: state.shown.map(|(seq, micros, face)| FrameListing { seq, t: micros as f64 / 1e6, face }),
+            neutral: state.neutral.as_ref().map(|Neutral { session, calibration, .. }| NeutralListing {
+                session: *session,
+                t: calibration.t,
+                num_frames: calibration.num_frames,
+                requested: calibration.requested,
+            }),
         }
     }
 }
@@ -275,6 +312,14 @@ impl Publishing {
         // Under the lock, so that states stand in the slot in their order.
         self.room.slot.send_replace(Some(Arc::new(Latest { index, key, delta, json: OnceLock::new() })));
         true
+    }
+
+    /// Makes `calibration` the neutral face that the room keeps, unless a later session has left one or it is kept already.
+    pub fn keep_neutral(&self, hello: &PublishHello, calibration: &Calibration) {
+        let mut state = lock(&self.room.state);
+        if state.neutral.as_ref().is_none_or(|kept| kept.session <= self.session && kept.calibration != *calibration) {
+            state.neutral = Some(Neutral { session: self.session, hello: hello.clone(), calibration: calibration.clone() });
+        }
     }
 }
 

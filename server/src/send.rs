@@ -1,5 +1,6 @@
 //! `send`: publishes a feed in real time or as fast as the server takes it.
 
+use crate::clip::Clip;
 use crate::feed::{Feed, FeedError, FeedItem};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
@@ -11,6 +12,7 @@ use std::future::Future;
 use std::io::{BufRead, BufReader, Cursor};
 use std::path::PathBuf;
 use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpStream;
 use tokio::sync::oneshot;
@@ -55,6 +57,8 @@ pub enum SendSource {
     File(PathBuf),
     /// A feed's text, and what to call it.
     Text(String, String),
+    /// An animation clip, and what to call it.
+    Clip(Arc<Clip>, String),
 }
 
 /// What to send, where to and how.
@@ -102,6 +106,11 @@ pub async fn send(options: &SendOptions, progress: &ProgressBar, stop: impl Futu
             SendSource::Text(text, name) => {
                 progress.set_length(text.len() as u64);
                 let feed = Feed::new_for_any_character(Cursor::new(text.as_bytes()), name.clone())?;
+                send_once(feed, options, progress, &mut report, stop.as_mut()).await?
+            }
+            SendSource::Clip(clip, name) => {
+                progress.set_length(clip.num_bytes());
+                let feed = Feed::new_for_any_character(clip.reader(), name.clone())?;
                 send_once(feed, options, progress, &mut report, stop.as_mut()).await?
             }
         };

@@ -2,6 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
 
+mod clip_fixture;
+
+use rhytid_shared::view::ViewMessage;
 use std::io::{BufRead, BufReader, Read};
 use std::net::TcpStream;
 use std::path::PathBuf;
@@ -168,6 +171,44 @@ fn refused_frames_make_send_fail_and_say_how_many() {
     let stderr = String::from_utf8(output.stderr).unwrap();
     assert!(!output.status.success(), "{stderr}");
     assert_eq!(stderr.lines().last(), Some("error: sent 2 frames, of all messages the server refused 1"), "{stderr}");
+}
+
+#[test]
+fn a_clip_of_the_character_moves_the_viewers_bones() {
+    let (glb, _) = clip_fixture::with_clip();
+    let character = scratch("clip.glb", &glb);
+    let character = character.to_str().unwrap();
+    let served = Served::start(&["--character", character]);
+    let mut viewer = served.view("demo?format=json");
+    let to = format!("ws://{}", served.address);
+    let sender = Command::new(PROGRAM)
+        .args(["send", "--clip", "nod", "--character", character, "--to", &to])
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut rest = Vec::new();
+    let last = loop {
+        let message = viewer.read().expect("frames come");
+        let Message::Text(text) = message else { continue };
+        match serde_json::from_str(&text).expect("a message that this version knows") {
+            ViewMessage::Hello(hello) => rest = hello.character.bones,
+            ViewMessage::Frame(frame) if frame.t >= 0.9999 => break frame,
+            ViewMessage::Frame(_) => {}
+            ViewMessage::Error { code, message } => panic!("{code}: {message}"),
+        }
+    };
+    let output = sender.wait_with_output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && stderr.contains("sent 61 frames, none refused"), "{stderr}");
+    for (i, (bone, point)) in rest.iter().zip(&last.bones).enumerate() {
+        let rise = if i == 0 { 0.008 } else { 0.0 };
+        let wanted = [bone.rest[0], bone.rest[1] + rise, bone.rest[2]];
+        let is_there = wanted.iter().zip(point).all(|(wanted, got)| (wanted - got).abs() < 1e-4);
+        assert!(is_there, "{} is at {point:?}, expected {wanted:?}", bone.name);
+    }
+    // A turn of 0.4 rad about +Y.
+    assert!((last.head.rotation[1] - 0.2_f32.sin()).abs() < 2e-3, "{:?}", last.head);
+    assert!(last.influence.iter().any(|of_pose| of_pose[0] > 0.1), "the brow wrinkles: {:?}", last.influence);
 }
 
 #[cfg(unix)]

@@ -38,6 +38,8 @@ pub const MAX_MESSAGE_BYTES: usize = 256 << 10;
 /// Largest time on a sender's clock, seconds: the Unix clock stays below it for two centuries, and microseconds of it
 /// are whole numbers in an `f64`.
 pub const MAX_SECONDS: f64 = 9e9;
+/// Focal lengths from the widest lens to the longest, in widths of the picture: 157 degrees to 1 degree across.
+pub const FOCAL_RANGE: [f32; 2] = [0.1, 50.0];
 /// How far an evaluated point may travel from rest, metres: the range of a packet's 12-bit positions (25 µm a step).
 pub const MAX_BONE_TRAVEL: f32 = 0.0511875;
 /// How far the head may travel from its neutral place, metres.

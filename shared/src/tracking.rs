@@ -11,8 +11,8 @@ use glam::Vec3;
 
 pub use reader::PublishReader;
 
-/// A publisher's first message, checked.
-#[derive(Debug, Clone, PartialEq)]
+/// A publisher's first message, checked. By default one of an unnamed sender of weights or bones.
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct PublishHello {
     /// What the sender calls itself; at most 128 characters.
     pub source: String,
@@ -22,10 +22,21 @@ pub struct PublishHello {
     pub layout: Option<Layout>,
     /// Width and height of the tracker's picture, pixels; required with a layout.
     pub image: Option<[f32; 2]>,
-    /// Focal length of the tracker's camera, pixels; the image width serves where it is unknown.
+    /// Focal length of the tracker's camera, pixels; the image width serves where it is unknown. With an image within
+    /// [`FOCAL_RANGE`](crate::limits::FOCAL_RANGE) of its width.
     pub focal: Option<f32>,
     /// Take the room over from another publisher.
     pub takeover: bool,
+    /// Start from the neutral face that the room keeps of the same tracker, see [`Self::is_of_same_tracker`].
+    pub keep_neutral: bool,
+}
+
+impl PublishHello {
+    /// True where the two come from one tracker before one camera as far as they say, so that the neutral face of one
+    /// session is that of the other.
+    pub fn is_of_same_tracker(&self, other: &Self) -> bool {
+        (&self.source, &self.layout, self.image, self.focal) == (&other.source, &other.layout, other.image, other.focal)
+    }
 }
 
 /// One checked frame from a tracker. The buffers are reused from frame to frame.

@@ -4,8 +4,10 @@
 
 mod service {
     pub mod bad_input;
+    pub mod expressions;
     pub mod harness;
     pub mod http;
+    pub mod neutral;
     pub mod rooms;
     pub mod sending;
 }

@@ -96,11 +96,13 @@ impl PlayoutClock {
         }
     }
 
-    /// Slews the delay up to `now`.
-    pub(super) fn advance(&mut self, now: i64) {
-        let most = MAX_SLEW * (now - self.advanced_to).max(0) as f64;
+    /// Slews the delay up to `now`; returns how long that is after the last time, microseconds.
+    pub(super) fn advance(&mut self, now: i64) -> i64 {
+        let passed = (now - self.advanced_to).max(0);
+        let most = MAX_SLEW * passed as f64;
         self.lag += (self.target() as f64 - self.lag).clamp(-most, most);
         self.advanced_to = self.advanced_to.max(now);
+        passed
     }
 
     /// The moment on the sender's clock to show at `now`, microseconds.

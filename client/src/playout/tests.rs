@@ -182,6 +182,40 @@ fn silence_is_held_then_eased_to_neutral_and_left_without_a_jump() {
 }
 
 #[test]
+fn frame_that_ends_a_silence_without_catching_up_makes_no_jump() {
+    let mut playout = playout();
+    let end = play(&mut playout, 1, 0, 50, |_| 0.8);
+    let mut before = 0.8;
+    for now in (end..end + 700).step_by(16) {
+        before = x(playout.sample(ms(now)));
+    }
+    assert!(playout.state() == PlayoutState::Silent && before < 0.3, "{:?} {before}", playout.state());
+    // Older by more than the time since the last picture: the moment shown is now even further past the newest frame.
+    assert_eq!(playout.push(&face(1, 50, 49 * 40 * MS + 10 * MS, 0.8), ms(end + 705)), Pushed::Accepted);
+    let value = x(playout.sample(ms(end + 720)));
+    assert!((value - before).abs() < 0.02, "{before} -> {value}");
+    assert_eq!(playout.state(), PlayoutState::Live);
+}
+
+#[test]
+fn face_follows_frames_that_come_evenly_but_late() {
+    let mut playout = playout();
+    let interval = 1_000_000 / 60;
+    for k in 0..180_u32 {
+        // After a second the way takes 60 ms longer, which is more than the delay covers until it has grown.
+        let captured_at = interval * i64::from(k);
+        let now = Duration::from_micros((captured_at + if k < 60 { 0 } else { 60 * MS }).unsigned_abs());
+        let value = k as f32 / 180.0;
+        playout.push(&face(1, k, captured_at, value), now);
+        let shown = x(playout.sample(now));
+        if (72..85).contains(&k) {
+            assert!(playout.session.as_ref().is_some_and(|session| session.underrun > 0), "the test must run dry: frame {k}");
+            assert!(value - shown < 1.0 / 180.0, "frame {k}: {value} has come, {shown} is shown");
+        }
+    }
+}
+
+#[test]
 fn lost_face_is_said_at_its_own_moment() {
     let mut playout = playout();
     for k in 0..100 {
@@ -354,6 +388,24 @@ fn stalls_and_bursts_never_make_the_face_jump() {
     assert!(seen.stats.underruns >= 3, "the test must run dry: {seen:?}");
     assert!(seen.worst_step < TRUE_STEP * 3.0, "{seen:?}");
     assert!(seen.worst_error < CHORD_ERROR, "{seen:?}");
+}
+
+#[test]
+fn short_gap_after_a_long_one_does_not_hurry_the_face() {
+    // At 2.58 s a gap of 25 us cuts short the blend that makes up for one of 140 ms. Found by the property below.
+    let weather = Weather {
+        fps: 104.666_998_267_195_75,
+        drift: -0.003_158_316_547_460_624,
+        skew: 10_173_533,
+        jitter: 102,
+        stall_every: 2500,
+        stall: 255,
+        repeat_one_in: 1,
+        reorder_one_in: 3,
+    };
+    let seen = simulate(weather, 12, 9_941_353_126_481_814_668);
+    assert!(seen.stats.underruns >= 3, "the test must run dry: {seen:?}");
+    assert!(seen.worst_step < TRUE_STEP * 3.0, "{seen:?}");
 }
 
 #[test]

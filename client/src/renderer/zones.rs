@@ -25,11 +25,6 @@ impl ZoneScales {
         }
     }
 
-    /// Stretched zones have a map.
-    pub fn has_stretch(&self) -> bool {
-        self.stretched > 0.0
-    }
-
     /// Whether the character has what a way of blending reads.
     pub fn has(&self, blend: ZoneBlend) -> bool {
         blend != ZoneBlend::Difference || self.has_difference

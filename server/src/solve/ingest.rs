@@ -5,11 +5,10 @@ use super::points::PointSet;
 use glam::DVec2;
 use rhytid_shared::PublishHello;
 use rhytid_shared::layout::Layout;
+use rhytid_shared::limits::FOCAL_RANGE;
 
 /// Landmarks may lie outside the picture, but not by more than this many of its sizes.
 const FARTHEST: f32 = 10.0;
-/// Focal lengths from the widest lens to the longest, in widths of the picture: 157 degrees to 1 degree across.
-const FOCAL_RANGE: [f32; 2] = [0.1, 50.0];
 /// Points that spread less than this (root mean square), pixels, are no face.
 const LEAST_SPREAD: f64 = 0.3;
 /// A landmark less sure than this is not believed: its last place serves.

@@ -214,7 +214,7 @@ pub fn character_with_zones() -> Arc<Character> {
 pub const IMAGE: [f32; 2] = [640.0, 480.0];
 
 pub fn hello(layout: Option<Layout>, focal: Option<f32>) -> PublishHello {
-    PublishHello { source: "test".to_owned(), fps: Some(30.0), layout, image: Some(IMAGE), focal, takeover: false }
+    PublishHello { source: "test".to_owned(), fps: Some(30.0), layout, image: Some(IMAGE), focal, ..PublishHello::default() }
 }
 
 /// A head before a camera.

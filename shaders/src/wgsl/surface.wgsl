@@ -108,14 +108,20 @@ fn signed_code(texel: vec4<f32>) -> vec4<f32> {
     return texel * (255.0 / 127.0) - 128.0 / 127.0;
 }
 
-fn zone_amount(uv: vec2<f32>, weights: array<vec4<f32>, 2>) -> f32 {
-    return dot(textureSample(zone_masks, wrinkle_sampler, uv, 0), weights[0]) + dot(textureSample(zone_masks, wrinkle_sampler, uv, 1), weights[1]);
+// Shares of the eight zones at a place.
+fn masks_of(uv: vec2<f32>) -> array<vec4<f32>, 2> {
+    return array<vec4<f32>, 2>(textureSample(zone_masks, wrinkle_sampler, uv, 0), textureSample(zone_masks, wrinkle_sampler, uv, 1));
+}
+
+fn zone_amount(masks: array<vec4<f32>, 2>, weights: array<vec4<f32>, 2>) -> f32 {
+    return dot(masks[0], weights[0]) + dot(masks[1], weights[1]);
 }
 
 fn zone_slope(uv: vec2<f32>) -> vec2<f32> {
-    var slope = signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 0)).xy * zone_amount(uv, zone_weights.wrinkled);
+    let masks = masks_of(uv);
+    var slope = signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 0)).xy * zone_amount(masks, zone_weights.wrinkled);
     if ZONES_STRETCH == 1u {
-        slope += signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 1)).xy * zone_amount(uv, zone_weights.stretched);
+        slope += signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 1)).xy * zone_amount(masks, zone_weights.stretched);
     }
     return slope;
 }
@@ -135,7 +141,7 @@ fn wrinkled_normal(in: Varyings) -> vec3<f32> {
     }
     var normal = end_blend(blend);
     if ZONES == 2u {
-        let difference = signed_code(textureSample(zone_difference, wrinkle_sampler, in.uv)).xyz * zone_amount(in.uv, zone_weights.wrinkled);
+        let difference = signed_code(textureSample(zone_difference, wrinkle_sampler, in.uv)).xyz * zone_amount(masks_of(in.uv), zone_weights.wrinkled);
         normal = with_zones(normal, vec2<f32>(0.0), difference);
     } else if ZONES != 0u {
         normal = with_zones(normal, zone_slope(in.uv), vec3<f32>(0.0));

@@ -51,6 +51,7 @@ pub(super) struct Fields {
     pub image: Option<[f64; 2]>,
     pub focal: Option<f64>,
     pub takeover: bool,
+    pub keep_neutral: bool,
     pub t: Option<f64>,
     pub face: Option<bool>,
     pub has_landmarks: bool,
@@ -85,6 +86,7 @@ impl Fields {
             image: None,
             focal: None,
             takeover: false,
+            keep_neutral: false,
             t: None,
             face: None,
             has_landmarks: false,
@@ -109,7 +111,8 @@ impl Fields {
     fn clear(&mut self) {
         self.kind = None;
         (self.version, self.fps, self.focal, self.t) = (None, None, None, None);
-        (self.source, self.layout, self.image, self.takeover) = (None, None, None, false);
+        (self.source, self.layout, self.image) = (None, None, None);
+        (self.takeover, self.keep_neutral) = (false, false);
         self.face = None;
         (self.has_landmarks, self.has_confidence, self.has_weights) = (false, false, false);
         (self.has_bones, self.has_expressions) = (false, false);
@@ -157,7 +160,7 @@ enum Key {
 }
 
 /// Every field of every message.
-const KEYS: [&str; 16] = [
+const KEYS: [&str; 17] = [
     "type",
     "t",
     "landmarks",
@@ -174,6 +177,7 @@ const KEYS: [&str; 16] = [
     "image",
     "focal",
     "takeover",
+    "keep_neutral",
 ];
 
 impl<'de> serde::Deserialize<'de> for Key {
@@ -239,7 +243,8 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
                     fields.image = Some(size);
                 }
                 "focal" => fields.focal = Some(map.next_value_seed(Number("pixels"))?),
-                _ => fields.takeover = map.next_value_seed(Flag)?,
+                "takeover" => fields.takeover = map.next_value_seed(Flag)?,
+                _ => fields.keep_neutral = map.next_value_seed(Flag)?,
             }
             fields.reading = "";
         }

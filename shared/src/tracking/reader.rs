@@ -5,12 +5,12 @@ use super::{MessageError, PublishHello, PublishMessage, TrackingData, TrackingFr
 use crate::character::Character;
 use crate::face::HeadPose;
 use crate::layout::Layout;
-use crate::limits::{MAX_FEATURE_POINTS, MAX_SECONDS};
+use crate::limits::{FOCAL_RANGE, MAX_FEATURE_POINTS, MAX_SECONDS};
 use crate::names::NUM_ARKIT_SHAPES;
 use crate::view::PROTOCOL_VERSION;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Largest side of a tracker's picture and largest focal length, pixels.
+/// Largest side of a tracker's picture, pixels.
 const MAX_IMAGE: f64 = 1e5;
 /// Most frames a second a hello may claim: faster than any face camera.
 const MAX_FPS: f64 = 1000.0;
@@ -112,8 +112,9 @@ impl PublishReader {
             fps: fields.fps.map(|fps| within("fps", fps, MAX_FPS, "frames a second")).transpose()?,
             layout,
             image,
-            focal: fields.focal.map(|focal| within("focal", focal, MAX_IMAGE, "pixels")).transpose()?,
+            focal: fields.focal.map(|focal| check_focal(focal, image)).transpose()?,
             takeover: fields.takeover,
+            keep_neutral: fields.keep_neutral,
         })
     }
 
@@ -182,6 +183,19 @@ impl PublishReader {
 
 fn missing(field: &str, expected: &str) -> MessageError {
     MessageError::new("missing_field", format!("field {field} is missing, expected {expected}"))
+}
+
+/// A focal length in pixels that a lens can have before a picture of this size.
+fn check_focal(focal: f64, image: Option<[f32; 2]>) -> Result<f32, MessageError> {
+    let [least, most] = FOCAL_RANGE;
+    let (narrowest, widest) = image.map_or((0.0, MAX_IMAGE as f32), |[width, _]| (width, width));
+    let (shortest, longest) = (least * narrowest, most * widest);
+    let pixels = focal as f32;
+    if pixels > 0.0 && (shortest..=longest).contains(&pixels) {
+        return Ok(pixels);
+    }
+    let of = image.map_or(String::new(), |[width, _]| format!(", {least} to {most} times the picture's width of {width}"));
+    Err(MessageError::new("out_of_range", format!("field focal is {focal}, expected {shortest} to {longest} pixels{of}")))
 }
 
 fn check_layout(layout: LayoutField, features: Option<&BTreeSet<String>>) -> Result<Layout, MessageError> {
@@ -471,13 +485,21 @@ mod tests {
             (r#"{"type":"hello","version":1,"layout":"ibug68"}"#, "missing_field", "field image"),
             (r#"{"type":"hello","version":1,"layout":"ibug68","image":[0,5]}"#, "out_of_range", "image[0]"),
             (r#"{"type":"hello","version":1,"layout":"ibug68","image":[5,5,5]}"#, "wrong_count", "image has 3 numbers"),
-            (r#"{"type":"hello","version":1,"focal":-1}"#, "out_of_range", "focal"),
+            (r#"{"type":"hello","version":1,"focal":-1}"#, "out_of_range", "focal is -1, expected 0 to 5000000 pixels"),
+            (
+                r#"{"type":"hello","version":1,"layout":"ibug68","focal":39.9,"image":[400,300]}"#,
+                "out_of_range",
+                "focal is 39.9, expected 40 to 20000 pixels, 0.1 to 50 times the picture's width of 400",
+            ),
+            (r#"{"type":"hello","version":1,"image":[400,300],"focal":20001}"#, "out_of_range", "focal is 20001, expected 40 to 20000"),
+            (r#"{"type":"hello","version":1,"image":[400,300],"focal":1e300}"#, "out_of_range", "expected 40 to 20000"),
             (r#"{"type":"hello","version":1,"fps":0}"#, "out_of_range", "fps"),
             (
                 r#"{"type":"hello","version":1,"takeover":"yes"}"#,
                 "wrong_type",
                 "field takeover: invalid type: string \"yes\", expected true or false",
             ),
+            (r#"{"type":"hello","version":1,"keep_neutral":1}"#, "wrong_type", "field keep_neutral"),
         ] {
             let (mut reader, mut frame) = reader();
             let error = reader.read(text, &mut frame).expect_err(text);
@@ -491,6 +513,16 @@ mod tests {
             panic!("refused")
         };
         assert_eq!((hello.source.chars().count(), hello.layout, hello.takeover), (128, None, false));
+    }
+
+    #[test]
+    fn focal_lengths_that_lenses_have_are_taken() {
+        for (focal, image) in [(40.0, "400,300"), (20_000.0, "400,300"), (0.1, "1,1"), (4e6, "1e5,1")] {
+            let (mut reader, mut frame) = reader();
+            let text = format!(r#"{{"type":"hello","version":1,"focal":{focal},"image":[{image}],"keep_neutral":true}}"#);
+            let Ok(PublishMessage::Hello(hello)) = reader.read(&text, &mut frame) else { panic!("{text} is refused") };
+            assert_eq!((hello.focal, hello.keep_neutral), (Some(focal as f32), true));
+        }
     }
 
     #[test]
