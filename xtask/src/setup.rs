@@ -141,7 +141,7 @@ mod tests {
 
     #[test]
     fn one_command_installs_all_that_is_missing() {
-        let [driver, _, display] = &NEEDS;
+        let [driver, _, display, _] = &NEEDS;
         assert_eq!(
             command_for(&[driver, display]),
             "sudo apt-get install --no-install-recommends libvulkan1 mesa-vulkan-drivers xvfb xauth"
