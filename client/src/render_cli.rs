@@ -338,10 +338,15 @@ pub fn still(args: &StillArgs) -> Result<()> {
 
 /// One frame by itself, as the first of a session.
 pub fn solve_one(character: &Arc<Character>, data: TrackingData) -> std::result::Result<FaceFrame, SolveError> {
+    solve_first(character, &TrackingFrame::new(0.0, data))
+}
+
+/// As [`solve_one`], with all that a frame may say besides.
+pub fn solve_first(character: &Arc<Character>, tracked: &TrackingFrame) -> std::result::Result<FaceFrame, SolveError> {
     let hello = PublishHello { source: "still".into(), ..PublishHello::default() };
     let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
     let mut solved = FaceFrame::at_rest(character);
-    solver.solve(&TrackingFrame::new(0.0, data), &mut solved)?;
+    solver.solve(tracked, &mut solved)?;
     Ok(solved)
 }
 

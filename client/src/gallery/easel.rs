@@ -2,13 +2,12 @@
 
 use super::Result;
 use crate::asset::CharacterAsset;
-use crate::render_cli::{PictureError, averaged, load_character};
+use crate::render_cli::{PictureError, averaged, load_character, solve_first};
 use crate::renderer::{Camera, DrawSettings, Headless, RenderFrame};
 use glam::Vec3;
 use image::RgbaImage;
-use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::limits::MAX_EXPRESSIONS;
-use rhytid_shared::{ArkitShape, Character, FaceFrame, NUM_ARKIT_SHAPES, PublishHello, TrackingData, TrackingFrame};
+use rhytid_shared::{ArkitShape, Character, NUM_ARKIT_SHAPES, TrackingData, TrackingFrame};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -108,19 +107,7 @@ impl Easel {
             }
             tracked.expressions = Some(amounts);
         }
-        let hello = PublishHello {
-            source: "gallery".into(),
-            fps: None,
-            layout: None,
-            image: None,
-            focal: None,
-            takeover: false,
-            keep_neutral: false,
-        };
-        let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
-        let mut solved = FaceFrame::at_rest(character);
-        solver.solve(&tracked, &mut solved)?;
-        Ok(RenderFrame::from(&solved))
+        Ok(RenderFrame::from(&solve_first(character, &tracked)?))
     }
 }
 

@@ -17,8 +17,11 @@ fn whole(easel: &Easel, expression: &Expression) -> Result<RenderFrame> {
     easel.expression(expression.weights, &[(expression.name, 1.0)])
 }
 
-/// Amounts of two expressions, over each other.
-fn mixed(a: (&Expression, f32), b: (&Expression, f32)) -> (Vec<(&'static str, f32)>, [(&'static str, f32); 2]) {
+/// Names with amounts.
+type Amount = (&'static str, f32);
+
+/// Amounts of two expressions, over each other: shapes, then expressions.
+fn mixed(a: (&Expression, f32), b: (&Expression, f32)) -> (Vec<Amount>, [Amount; 2]) {
     let of = |(expression, amount): (&Expression, f32)| expression.weights.iter().map(move |&(name, weight)| (name, weight * amount));
     (of((a.0, a.1)).collect::<Vec<_>>().into_iter().chain(of((b.0, b.1)).collect::<Vec<_>>()).collect(), [(a.0.name, a.1), (b.0.name, b.1)])
 }

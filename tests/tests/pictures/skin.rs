@@ -121,7 +121,7 @@ fn scattering_of_an_edge(stage: &Stage) -> anyhow::Result<()> {
     const EDGE: usize = 32;
     const STEP: usize = 64;
     let row: Vec<(Vec3, f32)> = (0..SIZE[0] as usize)
-        .map(|x| (if x < EDGE || x >= STEP { Vec3::new(1.0, 0.8, 0.6) } else { Vec3::splat(0.05) }, if x < STEP { 0.0 } else { 0.05 }))
+        .map(|x| (if (EDGE..STEP).contains(&x) { Vec3::splat(0.05) } else { Vec3::new(1.0, 0.8, 0.6) }, if x < STEP { 0.0 } else { 0.05 }))
         .collect();
     let kernel = scattering::kernel(25);
     let pixels_per_mm_at_metre = 2.5;

@@ -8,13 +8,12 @@ use anyhow::{Context, ensure};
 use glam::{Vec2, Vec3, Vec4};
 use image::{Rgba, RgbaImage};
 use rhytid_client::asset::{MipChain, Texels, ZoneMaps};
+use rhytid_client::render_cli::solve_first;
 use rhytid_client::renderer::{AdapterChoice, WrinkleSystem, ZoneBlend, uniforms};
 use rhytid_client::twin::{self, zones::ZoneSample};
 use rhytid_client::{CharacterAsset, DrawSettings, Headless, RenderFrame, ViewMode};
-use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::limits::MAX_EXPRESSIONS;
-use rhytid_shared::{DEFAULT_CHARACTER_GLB, FaceFrame, PublishHello, TrackingData, TrackingFrame};
-use std::sync::Arc;
+use rhytid_shared::{DEFAULT_CHARACTER_GLB, TrackingData, TrackingFrame};
 
 const PROBE: &str = "
 struct Case { @location(0) uv: vec2<f32> }
@@ -136,12 +135,7 @@ fn expressed(stage: &Stage, expressions: &[(&str, f32)]) -> anyhow::Result<Rende
     }
     let data = TrackingData::Bones { points: Vec::new(), head: None };
     let tracked = TrackingFrame { expressions: Some(amounts), ..TrackingFrame::new(0.0, data) };
-    let hello =
-        PublishHello { source: "test".into(), fps: None, layout: None, image: None, focal: None, takeover: false, keep_neutral: false };
-    let mut solver = Solver::new(Arc::clone(character), &SolveConfig::default(), &hello)?;
-    let mut solved = FaceFrame::at_rest(character);
-    solver.solve(&tracked, &mut solved)?;
-    Ok(RenderFrame::from(&solved))
+    Ok(RenderFrame::from(&solve_first(character, &tracked)?))
 }
 
 /// Figure 1.5: negative weights cancel positive ones, and the forehead smooths out.

@@ -17,8 +17,9 @@ const MAP: usize = 256;
 /// Slope no fold is steeper than, as in the maps of the poses.
 const STEEPEST: f32 = 1.25;
 /// How much steeper the low-resolution map is drawn than it comes out of the relief: averaging over a texel of about a
-/// millimetre takes that much off the flanks of a furrow. Tuned by eye.
-const SHARPEN: f32 = 1.5;
+/// millimetre takes that much off the flanks of a furrow, and more off the narrow ones on the nose. Forehead, nose, chin;
+/// tuned by eye.
+const SHARPEN: [f32; 3] = [1.5, 2.0, 1.5];
 /// Share of the resting face's creases that the stretch map takes out.
 const SMOOTHED: f32 = 0.85;
 
@@ -47,8 +48,11 @@ pub fn paint(chart: &Chart, atlas: &Atlas) -> Result<PaintedZones> {
     let wrinkled: Vec<Option<[f32; 2]>> = (0..shares.len())
         .map(|i| {
             shares[i].as_ref()?;
-            let sum = folds.iter().fold(Vec2::ZERO, |sum, (slopes, weight)| sum + Vec2::from(slopes[i].unwrap_or_default()) * weight[i]);
-            Some((sum * SHARPEN).clamp_length_max(STEEPEST).to_array())
+            let sum = folds
+                .iter()
+                .zip(SHARPEN)
+                .fold(Vec2::ZERO, |sum, ((slopes, weight), sharpen)| sum + Vec2::from(slopes[i].unwrap_or_default()) * weight[i] * sharpen);
+            Some(sum.clamp_length_max(STEEPEST).to_array())
         })
         .collect();
     let wrinkled = reduced(atlas.size(), MAP, &wrinkled);
@@ -134,6 +138,8 @@ struct Face<'a> {
     bridge: f32,
     wings: f32,
     chin: Vec2,
+    /// z of the chin's front.
+    chin_front: f32,
 }
 
 impl<'a> Face<'a> {
@@ -148,6 +154,7 @@ impl<'a> Face<'a> {
             bridge: y(28),
             wings: y(33),
             chin: chart.unroll(chart.landmark(57).lerp(chart.landmark(8), 0.64)),
+            chin_front: chart.landmark(57).z.max(chart.landmark(8).z),
         }
     }
 
@@ -181,6 +188,8 @@ impl<'a> Face<'a> {
         let nose_left = smoothstep(-3.5, 3.5, x);
 
         let chin = smoothstep(1.2, 0.6, ((at - self.chin) / (Vec2::new(22.0, 15.5) * scale)).length());
+        // Skin under the jaw lies at the chin's height, too.
+        let chin = chin * smoothstep(24.0 * scale, 12.0 * scale, self.chin_front - texel.place.z);
         [
             forehead * outer * left,
             forehead * outer * (1.0 - left),
