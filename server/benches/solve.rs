@@ -51,6 +51,7 @@ fn whole(criterion: &mut Criterion) {
     criterion.bench_function("whole frame", |bencher| bencher.iter(|| solver.solve(black_box(frames.next()), &mut out)));
 
     let without = SolveConfig { estimate_weights: false, ..SolveConfig::default() };
+    let mut frames = Endless { frames: feed(&character, 900), next: 0, t: 0.0 };
     let mut solver = Solver::new(character.clone(), &without, &hello(Some(Layout::Ibug68), None)).expect("a good session");
     for _ in 0..3000 {
         solver.solve(frames.next(), &mut out).expect("a good frame");
