@@ -1,5 +1,6 @@
 //! What a user may set: the listening address, the character, every limit and every time-out.
 
+use crate::recording::RecordConfig;
 use crate::solve::SolveConfig;
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use serde::Deserialize;
@@ -56,6 +57,8 @@ pub struct ServerConfig {
     pub timeouts: Timeouts,
     /// Who may come from a browser.
     pub access: Access,
+    /// Recordings.
+    pub record: RecordConfig,
     /// The solve.
     pub solve: SolveConfig,
 }
@@ -68,6 +71,7 @@ impl Default for ServerConfig {
             limits: Limits::default(),
             timeouts: Timeouts::default(),
             access: Access::default(),
+            record: RecordConfig::default(),
             solve: SolveConfig::default(),
         }
     }
@@ -192,6 +196,19 @@ impl ServerConfig {
                 got: limits.message_bytes.to_string(),
                 expected: "1024 to 16777216",
             });
+        }
+        let record = &self.record;
+        if !(1..=4096).contains(&record.recordings) {
+            let got = record.recordings.to_string();
+            return Err(ServerConfigError::Range { field: "record.recordings", got, expected: "1 to 4096" });
+        }
+        if !(1 << 20..=1 << 44).contains(&record.file_bytes) {
+            let got = record.file_bytes.to_string();
+            return Err(ServerConfigError::Range { field: "record.file_bytes", got, expected: "1048576 to 17592186044416" });
+        }
+        if let Some(dir) = record.dir.as_ref().filter(|dir| !dir.is_dir()) {
+            let got = dir.display().to_string();
+            return Err(ServerConfigError::Range { field: "record.dir", got, expected: "a folder that exists" });
         }
         let timeouts = &self.timeouts;
         for (field, got) in [

@@ -1,7 +1,8 @@
 //! What is asked for over HTTP: pages, listings, the character, and the two kinds of WebSocket.
 
 use crate::config::Access;
-use crate::service::{Hub, Peer};
+use crate::recording::{RecordError, RecorderStatus};
+use crate::service::{self, Hub, Peer};
 use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
 use crate::{publish, viewer};
 use axum::Router;
@@ -10,7 +11,7 @@ use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{Html, IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use rhytid_shared::RoomName;
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -23,6 +24,7 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
         .route("/healthz", get(async || "ok\n"))
         .route("/metrics", get(metrics))
         .route("/api/rooms", get(rooms))
+        .route("/api/rooms/{room}/record/{action}", post(record))
         .route("/characters/{file}", get(character))
         .route("/v1/rooms/{room}/publish", get(publish_socket))
         .route("/v1/rooms/{room}/view", get(view_socket))
@@ -116,6 +118,41 @@ async fn metrics(State(hub): State<Arc<Hub>>, headers: HeaderMap) -> Response {
 
 async fn rooms(State(hub): State<Arc<Hub>>) -> Response {
     axum::Json(serde_json::json!({ "rooms": hub.rooms.list() })).into_response()
+}
+
+/// Begins or ends a recording; answers with its file's name.
+async fn record(State(hub): State<Arc<Hub>>, Path((room, action)): Path<(String, String)>) -> Response {
+    let room = match room_name(&room) {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    let answer = |status: RecorderStatus| axum::Json(serde_json::json!({ "recording": status })).into_response();
+    match action.as_str() {
+        "start" => {
+            let place = match hub.rooms.room(&room) {
+                Ok(place) => place,
+                Err(error) => return ErrorMessage::new(error.code(), error.to_string()).response(StatusCode::SERVICE_UNAVAILABLE),
+            };
+            match service::record(&hub, &place).await {
+                Ok(status) => answer(status),
+                Err(error) => {
+                    tracing::warn!(%room, %error, "recording refused");
+                    let (code, status) = match error {
+                        RecordError::NoFolder => ("no_recordings", StatusCode::FORBIDDEN),
+                        RecordError::Running => ("recording_already", StatusCode::CONFLICT),
+                        RecordError::TooMany { .. } => ("too_many_recordings", StatusCode::SERVICE_UNAVAILABLE),
+                        RecordError::Create { .. } | RecordError::Write(_) => ("recording_failed", StatusCode::INTERNAL_SERVER_ERROR),
+                    };
+                    ErrorMessage::new(code, error.to_string()).response(status)
+                }
+            }
+        }
+        "stop" => match hub.rooms.find(&room).and_then(|place| place.end_recording()) {
+            Some(status) => answer(status),
+            None => ErrorMessage::new("not_recording", "the room is not being recorded").response(StatusCode::CONFLICT),
+        },
+        _ => ErrorMessage::new("not_found", "expected record/start or record/stop").response(StatusCode::NOT_FOUND),
+    }
 }
 
 async fn character(State(hub): State<Arc<Hub>>, Path(file): Path<String>, headers: HeaderMap) -> Response {

@@ -1,7 +1,8 @@
 //! Takes what trackers see, moves a character's bones with it and streams the solved frames to viewers.
 //!
 //! `solve` and `pipeline` are pure: frames in, packets out. Everything else is the service around them: [`run`] serves,
-//! [`send()`] publishes feed files.
+//! [`send()`] publishes feed files,
+//! `recording` keeps rooms in files.
 
 #![forbid(unsafe_code)]
 
@@ -12,6 +13,7 @@ mod http;
 mod metrics;
 pub mod pipeline;
 mod publish;
+pub mod recording;
 mod room;
 mod send;
 mod service;

@@ -3,6 +3,7 @@
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
+use rhytid_server::recording::{RecordConfig, Recording, VerifyReport, verify};
 use rhytid_server::{Access, Clip, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, bind, load_character, run, send};
 use std::io::Write;
 use std::path::PathBuf;
@@ -31,6 +32,18 @@ enum Command {
     Serve(Box<ServeArgs>),
     /// Publish a feed file, or an animation clip of a character.
     Send(SendArgs),
+    /// Solve a recording again and compare every packet, byte by byte.
+    Verify(VerifyArgs),
+}
+
+#[derive(Args)]
+struct VerifyArgs {
+    /// The recording.
+    #[arg(value_name = "FILE.mcap")]
+    file: PathBuf,
+    /// The character it is of, instead of the built-in one.
+    #[arg(long, value_name = "FILE.glb")]
+    character: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -50,6 +63,8 @@ struct ServeArgs {
     timeouts: Timeouts,
     #[command(flatten)]
     access: Access,
+    #[command(flatten)]
+    record: RecordConfig,
 }
 
 #[derive(Args)]
@@ -107,6 +122,7 @@ async fn main() -> ExitCode {
     let result = match cli.command {
         Command::Serve(args) => serve(*args, matches.subcommand_matches("serve")).await,
         Command::Send(args) => send_feed(args).await,
+        Command::Verify(args) => verify_file(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -120,8 +136,8 @@ async fn main() -> ExitCode {
 /// Logs go to standard error; `RUST_LOG` overrules `-v`.
 fn start_log(cli: &Cli) {
     let level = match (cli.verbose, &cli.command) {
-        (0, Command::Send(_)) => "warn",
         (0, Command::Serve(_)) => "rhytid_server=info,warn",
+        (0, _) => "warn",
         (1, _) => "rhytid_server=debug,info",
         _ => "debug",
     };
@@ -158,6 +174,10 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "viewer-timeout": timeouts.viewer_idle,
         "write-timeout": timeouts.write,
         "room-timeout": timeouts.room_idle,
+        "record": record.dir,
+        "record-rooms": record.rooms,
+        "max-recordings": record.recordings,
+        "max-recording": record.file_bytes,
     }
     config.character = args.character.or(config.character);
     config.access.hosts.extend(args.access.hosts);
@@ -224,6 +244,23 @@ impl Signals {
         // Without a handler the system ends the process itself.
         let _ = tokio::signal::ctrl_c().await;
     }
+}
+
+fn verify_file(args: &VerifyArgs) -> anyhow::Result<()> {
+    let (character, _) = load_character(args.character.as_deref())?;
+    let mut recording = Recording::open(&args.file)?;
+    if recording.server() != env!("CARGO_PKG_VERSION") {
+        eprintln!("recorded by version {}, this is {}", recording.server(), env!("CARGO_PKG_VERSION"));
+    }
+    let VerifyReport { sessions, frames, not_compared, cut } = verify(&mut recording, &character)?;
+    println!("{frames} frames of {sessions} sessions give the recorded bytes");
+    if not_compared > 0 {
+        println!("not compared: {not_compared} packets of sessions that had begun before the recording");
+    }
+    if cut > 0 {
+        println!("the recording was cut: {cut} frames at its end have no packet");
+    }
+    Ok(())
 }
 
 async fn send_feed(args: SendArgs) -> anyhow::Result<()> {

@@ -27,6 +27,11 @@ pub(crate) struct Metrics {
     pub bytes_in: Counter,
     pub bytes_out: Counter,
     pub solve_seconds: Histogram,
+    pub recordings: Gauge,
+    pub recording_bytes: Counter,
+    pub recording_messages: Counter,
+    pub recording_dropped: Counter,
+    pub recording_failures: Counter,
     dropped: Family<Reason, Counter>,
     refused: Family<Reason, Counter>,
 }
@@ -45,6 +50,11 @@ impl Metrics {
             bytes_out: Counter::default(),
             // 2 µs to 4 ms.
             solve_seconds: Histogram::new(exponential_buckets(2e-6, 2.0, 12)),
+            recordings: Gauge::default(),
+            recording_bytes: Counter::default(),
+            recording_messages: Counter::default(),
+            recording_dropped: Counter::default(),
+            recording_failures: Counter::default(),
             dropped: Family::default(),
             refused: Family::default(),
             registry: Registry::default(),
@@ -58,6 +68,11 @@ impl Metrics {
         registry.register_with_unit("in", "Payload received from publishers", Unit::Bytes, metrics.bytes_in.clone());
         registry.register_with_unit("out", "Payload sent to viewers", Unit::Bytes, metrics.bytes_out.clone());
         registry.register_with_unit("solve", "Time to solve one frame", Unit::Seconds, metrics.solve_seconds.clone());
+        registry.register("recordings", "Recordings being made", metrics.recordings.clone());
+        registry.register_with_unit("recorded", "Written into recordings", Unit::Bytes, metrics.recording_bytes.clone());
+        registry.register("recorded_messages", "Messages, packets and events recorded", metrics.recording_messages.clone());
+        registry.register("recording_dropped", "Messages left out because the disk was too slow", metrics.recording_dropped.clone());
+        registry.register("recording_failures", "Recordings that ended before they were told to", metrics.recording_failures.clone());
         registry.register("frames_dropped", "Frames that were refused, or that a slow viewer skipped, by reason", metrics.dropped.clone());
         registry.register("sessions_ended", "Sockets refused or ended by either side, by reason", metrics.refused.clone());
         let metrics = Self { registry, ..metrics };

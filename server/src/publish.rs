@@ -2,7 +2,8 @@
 
 use crate::config::seconds;
 use crate::pipeline::Pipeline;
-use crate::room::{Evicted, Publishing, RoomError};
+use crate::recording::{Item, SessionEvent};
+use crate::room::{Evicted, MAIN_SLOT, Publishing, RoomError};
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
 use crate::solve::{Calibration, DelayReport, SolveError};
@@ -72,11 +73,11 @@ pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName) {
 
 /// Waits for the hello, claims the room and takes messages, however long each step may block, until the session ends, the
 /// service ends, another publisher takes the room, or nothing is heard any more.
-async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infallible, Stop> {
+async fn publish(hub: &Arc<Hub>, socket: &mut Socket, room: &RoomName) -> Result<Infallible, Stop> {
     let timeouts = &hub.config.timeouts;
     let mut shutdown = hub.shutdown.clone();
     let mut reader = PublishReader::new(&hub.character);
-    let hello = tokio::select! {
+    let (hello, hello_text) = tokio::select! {
         biased;
         () = stopped(&mut shutdown) => return Err(Ending::shutdown().into()),
         hello = tokio::time::timeout(seconds(timeouts.hello), read_hello(hub, socket, &mut reader)) => match hello {
@@ -86,10 +87,22 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infa
     };
     // Before the room is claimed: a hello that leads to nothing takes no room from anybody.
     let kept = hello.keep_neutral.then(|| hub.rooms.neutral(room, &hello)).flatten();
-    let (mut pipeline, has_kept) = start(hub, &hello, kept).map_err(|error| refusal("bad_hello", format!("hello: {error}")))?;
+    let (mut pipeline, has_kept) = start(hub, &hello, kept.clone()).map_err(|error| refusal("bad_hello", format!("hello: {error}")))?;
     let (place, evicted) = claim(hub, room, &hello)?;
     pipeline.set_session(place.session);
     tracing::info!(%room, session = place.session, source = hello.source, takeover = hello.takeover, has_kept, "publisher ready");
+    crate::service::record_by_itself(hub, &place.room).await;
+    place.record(|| {
+        Item::Event(SessionEvent::Start {
+            session: place.session,
+            slot: MAIN_SLOT.into(),
+            source: hello.source.clone(),
+            under_way: false,
+            kept_neutral: kept.filter(|_| has_kept).map(Box::new),
+            solve: Box::new(hub.config.solve.clone()),
+        })
+    });
+    place.record(|| Item::Text { slot: MAIN_SLOT.into(), t: None, text: hello_text });
     let heard = Heard::now();
     let mut session = Session::new(hub, place, pipeline, reader, hello);
     let stop = tokio::select! {
@@ -103,6 +116,7 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infa
     };
     // What has refined the neutral since it was told of.
     session.keep_neutral();
+    session.place.record(|| Item::Event(SessionEvent::End { session: session.place.session, frames: session.num_frames }));
     tracing::info!(%room, session = session.place.session, frames = session.num_frames, "publisher gone");
     Err(stop)
 }
@@ -118,11 +132,11 @@ fn start(hub: &Hub, hello: &PublishHello, kept: Option<Calibration>) -> Result<(
 }
 
 /// Reads up to the hello.
-async fn read_hello(hub: &Hub, socket: &mut Socket, reader: &mut PublishReader) -> Result<PublishHello, Stop> {
+async fn read_hello(hub: &Hub, socket: &mut Socket, reader: &mut PublishReader) -> Result<(PublishHello, Utf8Bytes), Stop> {
     let text = first_text(socket, hub).await?;
     hub.metrics.bytes_in.inc_by(text.len() as u64);
     match reader.read(&text, &mut TrackingFrame::default()) {
-        Ok(PublishMessage::Hello(hello)) => Ok(hello),
+        Ok(PublishMessage::Hello(hello)) => Ok((hello, text)),
         Ok(PublishMessage::Frame | PublishMessage::Calibrate) => unreachable!("the reader refuses both before a hello"),
         Err(MessageError { code, message }) => Err(refusal(code, message)),
     }
@@ -192,11 +206,11 @@ impl<'a> Session<'a> {
             match message {
                 Some(Ok(Message::Text(text))) => {
                     self.hub.metrics.bytes_in.inc_by(text.len() as u64);
-                    self.take(socket, &text).await?;
+                    self.take(socket, text).await?;
                 }
                 Some(Ok(Message::Binary(bytes))) => {
                     self.hub.metrics.bytes_in.inc_by(bytes.len() as u64);
-                    self.refuse(socket, ErrorMessage::new("binary_message", BINARY)).await?;
+                    self.refuse(socket, bytes, ErrorMessage::new("binary_message", BINARY)).await?;
                 }
                 Some(Ok(Message::Close(_))) | None => return Err(Stop::Gone("closed")),
                 Some(Ok(_)) => {}
@@ -207,14 +221,15 @@ impl<'a> Session<'a> {
     }
 
     /// Takes one text message.
-    async fn take(&mut self, socket: &mut Socket, text: &str) -> Result<(), Stop> {
-        match self.reader.read(text, &mut self.frame) {
+    async fn take(&mut self, socket: &mut Socket, text: Utf8Bytes) -> Result<(), Stop> {
+        match self.reader.read(&text, &mut self.frame) {
             Ok(PublishMessage::Calibrate) => {
                 if self.calibrations.take_if_free(Instant::now()) {
                     self.pipeline.calibrate();
+                    self.place.record(|| Item::Text { slot: MAIN_SLOT.into(), t: None, text });
                 } else {
                     let message = format!("more than {CALIBRATIONS_PER_SECOND} calibrations a second: this one is left out");
-                    return self.refuse(socket, ErrorMessage::new("too_many_calibrations", message)).await;
+                    return self.refuse(socket, text.into(), ErrorMessage::new("too_many_calibrations", message)).await;
                 }
             }
             Ok(PublishMessage::Hello(_)) => unreachable!("the reader refuses a second hello"),
@@ -222,10 +237,11 @@ impl<'a> Session<'a> {
                 let start = std::time::Instant::now();
                 if let Err(error) = self.pipeline.solve(&self.frame) {
                     self.reader.take_back();
-                    return self.refuse(socket, ErrorMessage::new("bad_frame", error.to_string())).await;
+                    return self.refuse(socket, text.into(), ErrorMessage::new("bad_frame", error.to_string())).await;
                 }
                 self.hub.metrics.solve_seconds.observe(start.elapsed().as_secs_f64());
                 let kind = self.pipeline.encode(&mut self.packet);
+                self.place.record(|| Item::Text { slot: MAIN_SLOT.into(), t: Some(self.frame.t), text });
                 if !self.place.publish(kind, &self.packet, self.pipeline.face()) {
                     return Err(taken_over());
                 }
@@ -233,10 +249,15 @@ impl<'a> Session<'a> {
                 self.num_frames += 1;
                 self.num_bad_in_a_row = 0;
             }
-            Err(error) => return self.refuse(socket, ErrorMessage::new(error.code, error.message)).await,
+            Err(error) => return self.refuse(socket, text.into(), ErrorMessage::new(error.code, error.message)).await,
         }
         if let Some(report) = self.pipeline.take_calibrated() {
             self.keep_neutral();
+            if let Some(calibration) = self.pipeline.calibration() {
+                self.place.record(|| {
+                    Item::Event(SessionEvent::Neutral { session: self.place.session, calibration: Box::new(calibration.clone()) })
+                });
+            }
             let answer = Answer::Calibrated {
                 t: report.t,
                 frames: report.num_frames,
@@ -271,7 +292,8 @@ impl<'a> Session<'a> {
     }
 
     /// Counts a bad message and says what is wrong with it; too many in a row end the session.
-    async fn refuse(&mut self, socket: &mut Socket, error: ErrorMessage) -> Result<(), Stop> {
+    async fn refuse(&mut self, socket: &mut Socket, bytes: Bytes, error: ErrorMessage) -> Result<(), Stop> {
+        self.place.record(|| Item::Refused { slot: MAIN_SLOT.into(), bytes });
         self.hub.metrics.drop_frames(error.code, 1);
         self.num_bad_in_a_row += 1;
         tracing::debug!(room = %self.place.room.name, code = error.code, message = error.message, "bad message from publisher");

@@ -1,7 +1,8 @@
 //! Rooms: where one publisher's packets meet any number of viewers. A room holds one state, the newest; nothing queues.
 
 use crate::metrics::Metrics;
-use crate::solve::Calibration;
+use crate::recording::{Item, RecordError, RecorderStatus, SessionEvent, Sink};
+use crate::solve::{Calibration, SolveConfig};
 use rhytid_shared::packet::{Decoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
 use rhytid_shared::{FaceFrame, PublishHello, RoomName};
@@ -92,6 +93,8 @@ struct RoomState {
     /// What the listing shows of the newest frame.
     shown: Option<(u32, u64, bool)>,
     neutral: Option<Neutral>,
+    /// What keeps its messages, also where that has failed.
+    recording: Option<Arc<Sink>>,
     empty_since: Instant,
 }
 
@@ -121,6 +124,8 @@ pub(crate) struct RoomListing {
     frame: Option<FrameListing>,
     /// The neutral face that the room keeps.
     neutral: Option<NeutralListing>,
+    /// The recording being made of it, or the last one where that has failed.
+    recording: Option<RecorderStatus>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -194,6 +199,16 @@ impl Rooms {
         Ok((Publishing { room, session }, evicted))
     }
 
+    /// The room, made where there is none.
+    pub fn room(&self, name: &RoomName) -> Result<Arc<Room>, RoomError> {
+        self.find_or_make(&mut lock(&self.by_name), name)
+    }
+
+    /// The room, where there is one.
+    pub fn find(&self, name: &RoomName) -> Option<Arc<Room>> {
+        lock(&self.by_name).get(name).cloned()
+    }
+
     fn find_or_make(&self, by_name: &mut BTreeMap<RoomName, Arc<Room>>, name: &RoomName) -> Result<Arc<Room>, RoomError> {
         if let Some(room) = by_name.get(name) {
             return Ok(room.clone());
@@ -212,6 +227,7 @@ impl Rooms {
                 key: None,
                 shown: None,
                 neutral: None,
+                recording: None,
                 empty_since: Instant::now(),
             }),
             metrics: self.metrics.clone(),
@@ -263,9 +279,49 @@ impl Room {
                 num_frames: calibration.num_frames,
                 requested: calibration.requested,
             }),
+            recording: state.recording.as_ref().map(|sink| sink.status()),
         }
     }
+
+    /// True while what happens here is recorded.
+    pub fn is_recorded(&self) -> bool {
+        lock(&self.state).recording.as_ref().is_some_and(|sink| !sink.has_ended())
+    }
+
+    /// Records into `sink` from now on. A publisher that is there is noted as under way, with the state that its packets refer to.
+    pub fn record_into(&self, sink: Arc<Sink>, solve: &SolveConfig) -> Result<RecorderStatus, RecordError> {
+        let mut state = lock(&self.state);
+        if state.recording.as_ref().is_some_and(|sink| !sink.has_ended()) {
+            return Err(RecordError::Running);
+        }
+        if let Some(publisher) = &state.publisher {
+            sink.put(Item::Event(SessionEvent::Start {
+                session: publisher.session,
+                slot: MAIN_SLOT.into(),
+                source: publisher.source.clone(),
+                under_way: true,
+                kept_neutral: None,
+                solve: Box::new(solve.clone()),
+            }));
+            if let Some(key) = &state.key {
+                sink.put(Item::Packet(key.bytes.clone()));
+            }
+        }
+        let status = sink.status();
+        state.recording = Some(sink);
+        Ok(status)
+    }
+
+    /// Ends the recording; its file is finished by its own thread.
+    pub fn end_recording(&self) -> Option<RecorderStatus> {
+        let sink = lock(&self.state).recording.take()?;
+        sink.put(Item::Event(SessionEvent::Stop { reason: "asked to".into() }));
+        Some(sink.status())
+    }
 }
+
+/// The slot of a publisher that names none.
+pub(crate) const MAIN_SLOT: &str = "main";
 
 /// A viewer's place in a room; given back on drop.
 pub(crate) struct Viewing {
@@ -303,6 +359,9 @@ impl Publishing {
         state.num_states += 1;
         let index = state.num_states;
         let bytes = Bytes::copy_from_slice(packet);
+        if let Some(sink) = &state.recording {
+            sink.put(Item::Packet(bytes.clone()));
+        }
         let (key, delta) = match (kind, &state.key) {
             (PacketKind::Delta, Some(key)) => (key.clone(), Some(bytes)),
             _ => (Arc::new(KeyPacket { index, bytes }), None),
@@ -312,6 +371,13 @@ impl Publishing {
         // Under the lock, so that states stand in the slot in their order.
         self.room.slot.send_replace(Some(Arc::new(Latest { index, key, delta, json: OnceLock::new() })));
         true
+    }
+
+    /// Records what `item` gives, where the room is recorded.
+    pub fn record(&self, item: impl FnOnce() -> Item) {
+        if let Some(sink) = &lock(&self.room.state).recording {
+            sink.put(item());
+        }
     }
 
     /// Makes `calibration` the neutral face that the room keeps, unless a later session has left one or it is kept already.

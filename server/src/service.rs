@@ -3,7 +3,8 @@
 use crate::config::{Limits, ServerConfig, ServerConfigError, seconds};
 use crate::http::router;
 use crate::metrics::Metrics;
-use crate::room::Rooms;
+use crate::recording::{RecordError, Recorder, RecorderStatus};
+use crate::room::{Room, Rooms};
 use crate::socket::{ErrorMessage, say_and_close};
 use crate::stream::TimedStream;
 use axum::extract::Request;
@@ -81,14 +82,40 @@ pub(crate) struct Hub {
     pub hello_character: CharacterHello,
     pub layout: PacketLayout,
     pub rooms: Rooms,
+    pub recorder: Recorder,
     pub metrics: Arc<Metrics>,
     pub listens_on_loopback: bool,
     /// True once the service ends.
     pub shutdown: watch::Receiver<bool>,
     /// Every task holds the hub, so this is dropped with the last of them, for which the service waits.
-    _tasks: mpsc::Sender<Infallible>,
+    tasks: mpsc::Sender<Infallible>,
     connections: Mutex<Connections>,
     refusals: Arc<Semaphore>,
+}
+
+/// Begins a recording of `room`, which ends with the room or when it is told to.
+pub(crate) async fn record(hub: &Arc<Hub>, room: &Arc<Room>) -> Result<RecorderStatus, RecordError> {
+    if room.is_recorded() {
+        return Err(RecordError::Running);
+    }
+    let (hub, room) = (hub.clone(), room.clone());
+    // A disk may take its time to make a file.
+    let begin = move || {
+        let sink = hub.recorder.start(&room.name, hub.tasks.clone())?;
+        room.record_into(sink, &hub.config.solve)
+    };
+    tokio::task::spawn_blocking(begin).await.expect("making a recording does not panic")
+}
+
+/// Begins the recording of a room that is recorded without being asked to, unless there is one.
+pub(crate) async fn record_by_itself(hub: &Arc<Hub>, room: &Arc<Room>) {
+    if hub.recorder.is_automatic(&room.name)
+        && let Err(error) = record(hub, room).await
+        && !matches!(error, RecordError::Running)
+    {
+        hub.metrics.recording_failures.inc();
+        tracing::error!(room = %room.name, %error, "the room is not recorded");
+    }
 }
 
 /// Done when the service ends.
@@ -130,9 +157,12 @@ pub async fn run(
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
     let character_url = format!("/characters/{}.glb", file_name(&character.name));
+    let hello_character = ViewHello::new("", &character, character_url.clone()).character;
+    let layout = PacketLayout::from(&*character);
     let hub = Arc::new(Hub {
-        hello_character: ViewHello::new("", &character, character_url.clone()).character,
-        layout: PacketLayout::from(&*character),
+        recorder: Recorder::new(config.record.clone(), hello_character.clone(), layout.clone(), metrics.clone()),
+        hello_character,
+        layout,
         rooms: Rooms::new(config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
         listens_on_loopback: address.ip().is_loopback(),
         character,
@@ -140,7 +170,7 @@ pub async fn run(
         character_url,
         metrics,
         shutdown: stops,
-        _tasks: tasks,
+        tasks,
         connections: Mutex::default(),
         refusals: Arc::new(Semaphore::new(MOST_REFUSALS)),
         config,

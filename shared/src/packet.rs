@@ -3,6 +3,7 @@
 //! [`PacketKind`] says what the bytes are. What both ends can work out for themselves is not sent: the points of bones that
 //! turn follow from their rotation, coefficients of poses that do not move a bone are 0, members of a group share theirs.
 
+mod batch;
 mod codes;
 mod kriging;
 mod layout;
@@ -12,7 +13,8 @@ mod range_coder;
 mod tests;
 
 use crate::face::FaceFrame;
-use codes::Codes;
+pub use batch::{BatchError, BatchReader, BatchWriter, MAX_BATCH};
+use codes::{Codes, Models};
 pub use layout::PacketLayout;
 use range_coder::{Reader, Writer};
 
@@ -47,6 +49,14 @@ pub enum PacketKind {
     Key,
     /// Differences against the last key packet.
     Delta,
+}
+
+impl PacketKind {
+    /// What `packet` says of itself in its first byte, where that is a packet's.
+    pub fn of(packet: &[u8]) -> Option<Self> {
+        let first = packet.first().filter(|first| *first & VERSION_MASK == VERSION && *first & FLAGS_UNUSED == 0)?;
+        Some(if first & FLAG_DELTA == 0 { Self::Key } else { Self::Delta })
+    }
 }
 
 /// The version nibble of byte 0.
@@ -144,17 +154,7 @@ impl Encoder {
         if !is_in_reach {
             return false;
         }
-        let distance = frame.seq - key.seq;
-        let expected = key.captured_at_micros.wrapping_add(key.interval_micros.wrapping_mul(u64::from(distance)));
-        let lateness = frame.captured_at_micros.wrapping_sub(expected) as i64;
-        self.begin(FLAG_DELTA, out);
-        put_varint(u64::from(frame.session), out);
-        put_varint(u64::from(frame.seq), out);
-        put_varint(u64::from(distance), out);
-        put_varint(((lateness << 1) ^ (lateness >> 63)) as u64, out);
-        let mut writer = Writer::new(out);
-        self.codes.transfer(&key.codes, false, &self.layout, &mut writer).expect("quantised codes are in their range");
-        writer.finish();
+        write_delta(&Head::of(frame), key, &mut self.codes, &self.layout, out);
         // Deltas grow as the face moves away from its key packet. Once they have cost as much more as a new key packet costs,
         // that is sent ("rent or buy": never more than twice what the best choice in hindsight costs).
         let length = out.len();
@@ -169,14 +169,7 @@ impl Encoder {
             Some(last) if !is_new => frame.captured_at_micros.saturating_sub(last),
             _ => 0,
         };
-        self.begin(0, out);
-        put_varint(u64::from(frame.session), out);
-        put_varint(u64::from(frame.seq), out);
-        put_varint(frame.captured_at_micros, out);
-        put_varint(interval_micros, out);
-        let mut writer = Writer::new(out);
-        self.codes.transfer(&self.rest, true, &self.layout, &mut writer).expect("quantised codes are in their range");
-        writer.finish();
+        write_key(&Head::of(frame), interval_micros, &mut self.codes, &self.rest, &self.layout, out);
         self.key_length = out.len();
         (self.shortest_delta, self.excess) = (usize::MAX, 0);
         let codes = match self.key.take() {
@@ -192,13 +185,57 @@ impl Encoder {
         });
         key.codes.copy_from(&self.codes);
     }
+}
 
-    fn begin(&self, kind: u8, out: &mut Vec<u8>) {
-        out.clear();
-        let face = if self.codes.face { FLAG_FACE } else { 0 };
-        let shapes = if self.codes.has_shapes { FLAG_SHAPES } else { 0 };
-        out.push(VERSION | kind | face | shapes);
+/// What stands before a packet's body, besides what refers to its key packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Head {
+    session: u32,
+    seq: u32,
+    captured_at_micros: u64,
+}
+
+impl Head {
+    fn of(frame: &FaceFrame) -> Self {
+        Self { session: frame.session, seq: frame.seq, captured_at_micros: frame.captured_at_micros }
     }
+}
+
+/// Writes the delta packet of `codes` into `out`, which is emptied first. `key` is of the same session and before it.
+fn write_delta(head: &Head, key: &Key, codes: &mut Codes, layout: &PacketLayout, out: &mut Vec<u8>) {
+    let distance = head.seq - key.seq;
+    let expected = key.captured_at_micros.wrapping_add(key.interval_micros.wrapping_mul(u64::from(distance)));
+    let lateness = head.captured_at_micros.wrapping_sub(expected) as i64;
+    begin(FLAG_DELTA, codes, out);
+    put_varint(u64::from(head.session), out);
+    put_varint(u64::from(head.seq), out);
+    put_varint(u64::from(distance), out);
+    put_varint(((lateness << 1) ^ (lateness >> 63)) as u64, out);
+    write_body(codes, &key.codes, Models::for_delta(), layout, out);
+}
+
+/// Writes the key packet of `codes` into `out`, which is emptied first.
+fn write_key(head: &Head, interval_micros: u64, codes: &mut Codes, rest: &Codes, layout: &PacketLayout, out: &mut Vec<u8>) {
+    begin(0, codes, out);
+    put_varint(u64::from(head.session), out);
+    put_varint(u64::from(head.seq), out);
+    put_varint(head.captured_at_micros, out);
+    put_varint(interval_micros, out);
+    write_body(codes, rest, Models::for_key(), layout, out);
+}
+
+fn begin(kind: u8, codes: &Codes, out: &mut Vec<u8>) {
+    out.clear();
+    let face = if codes.face { FLAG_FACE } else { 0 };
+    let shapes = if codes.has_shapes { FLAG_SHAPES } else { 0 };
+    out.push(VERSION | kind | face | shapes);
+}
+
+/// Writing changes nothing in `codes`: one code serves both directions.
+fn write_body(codes: &mut Codes, base: &Codes, mut models: Models, layout: &PacketLayout, out: &mut Vec<u8>) {
+    let mut writer = Writer::new(out);
+    codes.transfer(base, &mut models, layout, &mut writer).expect("quantised codes are in their range");
+    writer.finish();
 }
 
 /// Reads packets. Holds the last key packet; never panics, and allocates nothing after its first frame, whatever the bytes.
@@ -239,7 +276,7 @@ impl Decoder {
             kind = PacketKind::Key;
             captured_at_micros = take_varint(&mut rest)?;
             let interval_micros = take_varint(&mut rest)?;
-            read_body(&mut self.codes, &self.rest, true, &self.layout, rest)?;
+            read_body(&mut self.codes, &self.rest, Models::for_key(), &self.layout, rest)?;
             let codes = match self.key.take() {
                 Some(key) => key.codes,
                 None => self.rest.clone(),
@@ -262,7 +299,7 @@ impl Decoder {
             })?;
             let expected = key.captured_at_micros.wrapping_add(key.interval_micros.wrapping_mul(u64::from(distance)));
             captured_at_micros = expected.wrapping_add(lateness as u64);
-            read_body(&mut self.codes, &key.codes, false, &self.layout, rest)?;
+            read_body(&mut self.codes, &key.codes, Models::for_delta(), &self.layout, rest)?;
         }
         frame.session = session;
         frame.seq = seq;
@@ -272,9 +309,9 @@ impl Decoder {
     }
 }
 
-fn read_body(codes: &mut Codes, base: &Codes, is_key: bool, layout: &PacketLayout, body: &[u8]) -> Result<(), PacketError> {
+fn read_body(codes: &mut Codes, base: &Codes, mut models: Models, layout: &PacketLayout, body: &[u8]) -> Result<(), PacketError> {
     let mut reader = Reader::new(body);
-    codes.transfer(base, is_key, layout, &mut reader)?;
+    codes.transfer(base, &mut models, layout, &mut reader)?;
     if reader.is_at_end() { Ok(()) } else { Err(PacketError::Broken("bytes are left over")) }
 }
 

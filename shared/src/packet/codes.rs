@@ -121,40 +121,39 @@ impl Codes {
         frame.head.position = Vec3::from(self.head_position.map(head_value));
     }
 
-    /// Writes these codes as differences from `base`, or reads them: `coder` decides. `is_key` says that `base` is rest.
-    /// Codes that leave their range are an error.
-    pub fn transfer(&mut self, base: &Self, is_key: bool, layout: &PacketLayout, coder: &mut impl Coder) -> Result<(), PacketError> {
-        self.transfer_points(base, is_key, layout, coder)?;
-        let mut turns = [Numbers::expecting(if is_key { 5 } else { 4 }), Numbers::rare(), Numbers::rare()];
-        let mut dropped = Model::expecting(DROPPED_IS_SAME);
+    /// Writes these codes as differences from `base`, or reads them: `coder` decides, `models` learn. Codes that leave their
+    /// range are an error.
+    pub fn transfer(&mut self, base: &Self, models: &mut Models, layout: &PacketLayout, coder: &mut impl Coder) -> Result<(), PacketError> {
+        self.transfer_points(base, &mut models.points, layout, coder)?;
         for (code, base) in self.turns.iter_mut().zip(&base.turns) {
-            transfer_rotation(code, base, &mut turns, &mut dropped, coder)?;
+            transfer_rotation(code, base, &mut models.turns, &mut models.dropped, coder)?;
         }
-        self.transfer_influences(base, layout, coder)?;
-        let mut zones = Numbers::expecting(3);
+        self.transfer_influences(base, &mut models.influences, layout, coder)?;
         for (code, base) in self.zones.iter_mut().zip(&base.zones) {
-            transfer_code(code, *base, -255..=255, &mut zones, coder)?;
+            transfer_code(code, *base, -255..=255, &mut models.zones, coder)?;
         }
         if self.has_shapes {
-            let mut shapes = Numbers::expecting(3);
             for (code, base) in self.shapes.iter_mut().zip(&base.shapes) {
-                transfer_code(code, *base, 0..=255, &mut shapes, coder)?;
+                transfer_code(code, *base, 0..=255, &mut models.shapes, coder)?;
             }
         } else {
             self.shapes = [0; NUM_ARKIT_SHAPES];
         }
-        let mut head = [Numbers::expecting(5); 3];
-        transfer_rotation(&mut self.head_rotation, &base.head_rotation, &mut head, &mut dropped, coder)?;
-        let mut head = Numbers::expecting(8);
+        transfer_rotation(&mut self.head_rotation, &base.head_rotation, &mut models.head_rotation, &mut models.dropped, coder)?;
         for (code, base) in self.head_position.iter_mut().zip(&base.head_position) {
-            transfer_code(code, *base, -HEAD_MAX..=HEAD_MAX, &mut head, coder)?;
+            transfer_code(code, *base, -HEAD_MAX..=HEAD_MAX, &mut models.head_position, coder)?;
         }
         Ok(())
     }
 
     /// A bone is expected to move with the bones before it and, in z, to slide along the face.
-    fn transfer_points(&mut self, base: &Self, is_key: bool, layout: &PacketLayout, coder: &mut impl Coder) -> Result<(), PacketError> {
-        let mut axes = [Numbers::expecting(if is_key { 5 } else { 4 }); 3];
+    fn transfer_points(
+        &mut self,
+        base: &Self,
+        axes: &mut [Numbers; 3],
+        layout: &PacketLayout,
+        coder: &mut impl Coder,
+    ) -> Result<(), PacketError> {
         let mut seen = [[0.0; MAX_BONES]; 3];
         for i in 0..layout.moving.len() {
             let slope = slope_at(base.points[i], layout.slopes[i]);
@@ -177,14 +176,19 @@ impl Codes {
     }
 
     /// Coefficients are expected to be what the bones just sent make them ([D09] 5.1, 5.2), as far as they were that in the base.
-    fn transfer_influences(&mut self, base: &Self, layout: &PacketLayout, coder: &mut impl Coder) -> Result<(), PacketError> {
-        let mut numbers = Numbers::rare();
+    fn transfer_influences(
+        &mut self,
+        base: &Self,
+        numbers: &mut Numbers,
+        layout: &PacketLayout,
+        coder: &mut impl Coder,
+    ) -> Result<(), PacketError> {
         for (i, slot) in layout.slots.iter().enumerate() {
             let off = base.influences[i] - base.projected(slot, layout);
             // One code is rounding, more is another way of evaluating.
             let off = if off.abs() > 1 { off } else { 0 };
             let expected = (self.projected(slot, layout) + off).clamp(0, 255);
-            transfer_code(&mut self.influences[i], expected, 0..=255, &mut numbers, coder)?;
+            transfer_code(&mut self.influences[i], expected, 0..=255, numbers, coder)?;
         }
         Ok(())
     }
@@ -200,6 +204,53 @@ impl Codes {
             sum += moved.dot(member.direction).clamp(0.0, 1.0);
         }
         unit_code(sum / slot.moved.len() as f32)
+    }
+}
+
+/// What is expected of every kind of number in a body.
+#[derive(Debug, Clone)]
+pub(super) struct Models {
+    points: [Numbers; 3],
+    turns: [Numbers; 3],
+    dropped: Model,
+    influences: Numbers,
+    zones: Numbers,
+    shapes: Numbers,
+    head_rotation: [Numbers; 3],
+    head_position: Numbers,
+}
+
+impl Models {
+    /// For differences from rest.
+    pub fn for_key() -> Self {
+        Self { points: [Numbers::expecting(5); 3], turns: [Numbers::expecting(5), Numbers::rare(), Numbers::rare()], ..Self::for_delta() }
+    }
+
+    /// For differences from the frame before, over many frames.
+    pub fn for_batch() -> Self {
+        Self {
+            points: [Numbers::expecting(1); 3],
+            turns: [Numbers::expecting(1); 3],
+            zones: Numbers::expecting(1),
+            shapes: Numbers::expecting(1),
+            head_rotation: [Numbers::expecting(2); 3],
+            head_position: Numbers::expecting(4),
+            ..Self::for_delta()
+        }
+    }
+
+    /// For differences from a key packet.
+    pub fn for_delta() -> Self {
+        Self {
+            points: [Numbers::expecting(4); 3],
+            turns: [Numbers::expecting(4), Numbers::rare(), Numbers::rare()],
+            dropped: Model::expecting(DROPPED_IS_SAME),
+            influences: Numbers::rare(),
+            zones: Numbers::expecting(3),
+            shapes: Numbers::expecting(3),
+            head_rotation: [Numbers::expecting(5); 3],
+            head_position: Numbers::expecting(8),
+        }
     }
 }
 
@@ -269,7 +320,7 @@ const MAX_LENGTH: i32 = 17;
 /// A number is its bit length in unary, its bits below the first, and its sign. The model of each unary bit depends on how
 /// far it is from the running mean of lengths, not on the length itself, so that few bits teach it.
 #[derive(Debug, Clone, Copy)]
-struct Numbers {
+pub(super) struct Numbers {
     /// Does the length end here? By distance from the mean.
     ends: [Model; 8],
     /// The bit below the first.
@@ -280,7 +331,7 @@ struct Numbers {
 
 impl Numbers {
     /// Numbers of about `length` bits.
-    fn expecting(length: i32) -> Self {
+    pub fn expecting(length: i32) -> Self {
         // Chance that a length goes on, in 1/256 of ending with a 0; tuned on real feeds.
         const ENDS: [u8; 8] = [20, 30, 50, 90, 120, 140, 170, 200];
         Self { ends: ENDS.map(Model::expecting), second: Model::expecting(140), mean: length * 16 }
@@ -291,7 +342,8 @@ impl Numbers {
         Self { ends: [Model::expecting(225); 8], second: Model::expecting(140), mean: 0 }
     }
 
-    fn transfer(&mut self, value: i32, coder: &mut impl Coder) -> i32 {
+    /// Writes `value`, at most 17 bits of magnitude, or reads one and returns it.
+    pub fn transfer(&mut self, value: i32, coder: &mut impl Coder) -> i32 {
         let magnitude = value.unsigned_abs();
         let wanted = 32 - magnitude.leading_zeros() as i32;
         let mean = (self.mean + 8) >> 4;

@@ -1,0 +1,339 @@
+//! Reading a recording. The bytes are anybody's: every length is checked against the file before anything is held, a chunk has at
+//! most [`MAX_CHUNK`] bytes in either form, and what is broken is one error that says where.
+
+use super::format::{Entry, MAX_CHUNK, PROFILE, SessionEvent, Topic, VERSION};
+use mcap::records::{Record, op};
+use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
+use mcap::{MAGIC, McapError};
+use rhytid_shared::packet::{BatchError, BatchReader, PacketError, PacketLayout};
+use rhytid_shared::view::CharacterHello;
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// A record's opcode and length.
+const RECORD_HEAD: u64 = 9;
+/// Longest record outside chunks that is looked at, bytes: an index of a chunk has less than 100 and 16 a message.
+const MAX_RECORD: usize = 16 << 20;
+/// Most chunks: some three months, and 100 MB of their index.
+const MAX_CHUNKS: usize = 10_000_000;
+/// Chunks that a batch of packets may go back to before its recording is called broken: a key packet stands in the stream every two
+/// seconds of the sender's time, which may run four times as fast as the server's.
+const MAX_BACK: usize = 64;
+
+/// Why a recording could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The file could not be opened or read.
+    #[error("cannot read recording {path}: {source}")]
+    Io {
+        /// The file as it was named.
+        path: String,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The file is no recording, or broken.
+    #[error("recording {path}: {problem}")]
+    Broken {
+        /// The file as it was named.
+        path: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+}
+
+/// Where a chunk stands, and from when to when its messages reached the server, Unix clock, ns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ChunkPlace {
+    /// Offset of its record in the file.
+    pub offset: u64,
+    /// Length of its record, bytes.
+    pub length: u64,
+    /// Earliest `log_time`.
+    pub start: u64,
+    /// Latest `log_time`.
+    pub end: u64,
+}
+
+/// An open recording.
+pub struct Recording {
+    file: File,
+    path: String,
+    length: u64,
+    chunks: Vec<ChunkPlace>,
+    channels: HashMap<u16, Option<Topic>>,
+    room: String,
+    server: String,
+    character: CharacterHello,
+    layout: PacketLayout,
+    /// Where whole chunks end, if the file was not finished.
+    cut_at: Option<u64>,
+}
+
+impl Recording {
+    /// Opens a file and reads its index; of a file that was not finished, what stands in it whole.
+    pub fn open(path: &Path) -> Result<Self, ReadError> {
+        let shown = path.display().to_string();
+        let io = |source| ReadError::Io { path: shown.clone(), source };
+        let mut file = File::open(path).map_err(io)?;
+        let length = file.metadata().map_err(io)?.len();
+        let broken = |problem: String| ReadError::Broken { path: shown.clone(), problem };
+        let mut magic = [0; MAGIC.len()];
+        if length < MAGIC.len() as u64 || file.read_exact(&mut magic).is_err() || magic != *MAGIC {
+            return Err(broken("it is no MCAP file".into()));
+        }
+        let mut channels = HashMap::new();
+        let (mut chunks, cut_at) = match read_summary(&mut file, length) {
+            Ok(Some(summary)) => {
+                channels.extend(summary.channels.iter().map(|(id, channel)| (*id, Topic::parse(&channel.topic))));
+                let chunks = summary.chunk_indexes.iter().map(|index| ChunkPlace {
+                    offset: index.chunk_start_offset,
+                    length: index.chunk_length,
+                    start: index.message_start_time,
+                    end: index.message_end_time,
+                });
+                (chunks.collect(), None)
+            }
+            Ok(None) | Err(_) => {
+                let (chunks, end) = scan(&mut file, length).map_err(io)?;
+                (chunks, Some(end))
+            }
+        };
+        if chunks.len() > MAX_CHUNKS {
+            return Err(broken(format!("it has {} chunks, expected up to {MAX_CHUNKS}", chunks.len())));
+        }
+        chunks.sort_by_key(|chunk: &ChunkPlace| chunk.offset);
+        let mut recording = Unchecked { file, path: shown, length, channels };
+        let mut first = None;
+        // Channels stand where they were first used; a finished file lists them at its end as well.
+        let until = if cut_at.is_some() { chunks.len() } else { 1 };
+        for chunk in chunks.iter().take(until) {
+            let entries = recording.read(chunk)?;
+            if first.is_none() {
+                first = entries.into_iter().next();
+            }
+        }
+        let Unchecked { file, path, length, channels } = recording;
+        let broken = |problem: String| ReadError::Broken { path: path.clone(), problem };
+        let first = first.filter(|first| first.topic == Topic::Session);
+        let first = first.ok_or_else(|| broken(format!("its first message is none of a {PROFILE} recording")))?;
+        match serde_json::from_slice(&first.data) {
+            Ok(SessionEvent::Recording { version: VERSION, room, server, character }) => {
+                let layout = PacketLayout::try_from(&*character).map_err(|error: PacketError| broken(error.to_string()))?;
+                Ok(Self { file, path, length, chunks, channels, room, server, character: *character, layout, cut_at })
+            }
+            Ok(SessionEvent::Recording { version, .. }) => Err(broken(format!("it is of version {version}, expected {VERSION}"))),
+            Ok(_) => Err(broken("its first message says nothing about it".into())),
+            Err(error) => Err(broken(format!("its first message: {error}"))),
+        }
+    }
+
+    /// The file as it was named.
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
+    /// The room.
+    pub fn room(&self) -> &str {
+        &self.room
+    }
+
+    /// Version of the program that wrote it.
+    pub fn server(&self) -> &str {
+        &self.server
+    }
+
+    /// The character that the packets move.
+    pub fn character(&self) -> &CharacterHello {
+        &self.character
+    }
+
+    /// What is needed to read packets.
+    pub fn layout(&self) -> &PacketLayout {
+        &self.layout
+    }
+
+    /// Chunks in their order.
+    pub fn chunks(&self) -> &[ChunkPlace] {
+        &self.chunks
+    }
+
+    /// Bytes that make no whole chunk at the end of a file that was not finished; nothing for one that was.
+    pub fn cut_off(&self) -> Option<u64> {
+        self.cut_at.map(|end| self.length - end)
+    }
+
+    /// When it begins, Unix clock, ns.
+    pub fn start(&self) -> u64 {
+        self.chunks.iter().map(|chunk| chunk.start).min().unwrap_or(0)
+    }
+
+    /// How long it is, seconds.
+    pub fn seconds(&self) -> f64 {
+        let end = self.chunks.iter().map(|chunk| chunk.end).max().unwrap_or(0);
+        end.saturating_sub(self.start()) as f64 / 1e9
+    }
+
+    /// The messages of chunk `index`, in their order.
+    pub fn read_chunk(&mut self, index: usize) -> Result<Vec<Entry>, ReadError> {
+        let chunk = self.chunks[index];
+        let mut source = Unchecked {
+            file: self.file.try_clone().map_err(|source| ReadError::Io { path: self.path.clone(), source })?,
+            path: self.path.clone(),
+            length: self.length,
+            channels: std::mem::take(&mut self.channels),
+        };
+        let entries = source.read(&chunk);
+        self.channels = source.channels;
+        entries
+    }
+
+    /// Index of the first chunk from which packets can be read so that the first of those at `from` (Unix clock, ns) or later are
+    /// among them.
+    pub fn chunk_before(&mut self, from: u64) -> Result<usize, ReadError> {
+        // A batch is of the time of its first packet and stands behind its messages.
+        let mut index = self.chunks.partition_point(|chunk| chunk.end < from).min(self.chunks.len().saturating_sub(1));
+        for _ in 0..MAX_BACK {
+            let is_enough =
+                |entry: &Entry| entry.topic == Topic::Packets && BatchReader::starts_anew(&entry.data) && entry.log_time <= from;
+            if index == 0 || self.read_chunk(index)?.iter().any(is_enough) {
+                return Ok(index);
+            }
+            index -= 1;
+        }
+        Ok(index)
+    }
+
+    /// An error about this file.
+    pub fn broken(&self, problem: impl Into<String>) -> ReadError {
+        ReadError::Broken { path: self.path.clone(), problem: problem.into() }
+    }
+
+    /// An error about a batch of packets that reached the server at `log_time`.
+    pub fn broken_batch(&self, log_time: u64, error: &BatchError) -> ReadError {
+        self.broken(format!("packets at {:.3} s: {error}", log_time.saturating_sub(self.start()) as f64 / 1e9))
+    }
+}
+
+/// A file whose first message has not been looked at.
+struct Unchecked {
+    file: File,
+    path: String,
+    length: u64,
+    /// By id; nothing for channels that are not ours.
+    channels: HashMap<u16, Option<Topic>>,
+}
+
+impl Unchecked {
+    fn read(&mut self, chunk: &ChunkPlace) -> Result<Vec<Entry>, ReadError> {
+        let broken = |problem: String| ReadError::Broken { path: self.path.clone(), problem };
+        let end = chunk.offset.checked_add(chunk.length).filter(|end| *end <= self.length);
+        if end.is_none() || chunk.length > MAX_CHUNK as u64 || chunk.length < RECORD_HEAD {
+            return Err(broken(format!(
+                "chunk at byte {} has {} bytes, expected up to {MAX_CHUNK} in the file",
+                chunk.offset, chunk.length
+            )));
+        }
+        let mut bytes = vec![0; chunk.length as usize];
+        self.file
+            .seek(SeekFrom::Start(chunk.offset))
+            .and_then(|_| self.file.read_exact(&mut bytes))
+            .map_err(|source| ReadError::Io { path: self.path.clone(), source })?;
+        let at = |error: String| ReadError::Broken { path: self.path.clone(), problem: format!("chunk at byte {}: {error}", chunk.offset) };
+        let mut entries = Vec::new();
+        match mcap::parse_record(bytes[0], &bytes[RECORD_HEAD as usize..]) {
+            // Uncompressed chunks have lengths of their own that nobody checks.
+            Ok(Record::Chunk { header, .. }) if header.compression == "zstd" => {}
+            Ok(Record::Chunk { header, .. }) => return Err(at(format!("it is compressed by {:?}, expected \"zstd\"", header.compression))),
+            Ok(_) => return Err(at("it is no chunk".into())),
+            Err(error) => return Err(at(error.to_string())),
+        }
+        let options = LinearReaderOptions::default()
+            .with_skip_start_magic(true)
+            .with_skip_end_magic(true)
+            .with_prevalidate_chunk_crcs(true)
+            .with_record_length_limit(MAX_CHUNK);
+        let mut reader = LinearReader::new_with_options(options);
+        let mut rest = &bytes[..];
+        while let Some(event) = reader.next_event() {
+            match event.map_err(|error| at(error.to_string()))? {
+                LinearReadEvent::ReadRequest(wanted) => {
+                    let num = wanted.min(rest.len());
+                    reader.insert(num).copy_from_slice(&rest[..num]);
+                    reader.notify_read(num);
+                    rest = &rest[num..];
+                }
+                LinearReadEvent::Record { opcode, data } => match mcap::parse_record(opcode, data) {
+                    Ok(Record::Channel(channel)) => {
+                        self.channels.insert(channel.id, Topic::parse(&channel.topic));
+                    }
+                    Ok(Record::Message { header, data }) => {
+                        let topic = self
+                            .channels
+                            .get(&header.channel_id)
+                            .ok_or_else(|| at(format!("channel {} is not there", header.channel_id)))?;
+                        if let Some(topic) = topic {
+                            let (log_time, publish_time) = (header.log_time, header.publish_time);
+                            entries.push(Entry { topic: topic.clone(), log_time, publish_time, data: data.into_owned() });
+                        }
+                    }
+                    Ok(_) => {}
+                    Err(error) => return Err(at(error.to_string())),
+                },
+            }
+        }
+        Ok(entries)
+    }
+}
+
+/// The index at the end of a finished file.
+fn read_summary(file: &mut File, length: u64) -> Result<Option<mcap::Summary>, McapError> {
+    let options = SummaryReaderOptions::default().with_file_size(length).with_record_length_limit(MAX_RECORD);
+    let mut reader = SummaryReader::new_with_options(options);
+    while let Some(event) = reader.next_event() {
+        match event? {
+            SummaryReadEvent::SeekRequest(to) => {
+                let at = file.seek(to)?;
+                reader.notify_seeked(at);
+            }
+            SummaryReadEvent::ReadRequest(wanted) => {
+                let num = file.read(reader.insert(wanted))?;
+                reader.notify_read(num);
+            }
+        }
+    }
+    Ok(reader.finish())
+}
+
+/// Finds the chunks of a file that has no index, by the heads of its records; and where the last whole record ends.
+pub(super) fn scan(file: &mut File, length: u64) -> io::Result<(Vec<ChunkPlace>, u64)> {
+    let (mut at, mut chunks) = (MAGIC.len() as u64, Vec::new());
+    let mut head = [0; RECORD_HEAD as usize];
+    while at + RECORD_HEAD <= length && chunks.len() < MAX_CHUNKS {
+        file.seek(SeekFrom::Start(at))?;
+        file.read_exact(&mut head)?;
+        let record = u64::from_le_bytes(head[1..].try_into().expect("eight bytes"));
+        let Some(end) = at.checked_add(RECORD_HEAD).and_then(|begin| begin.checked_add(record)).filter(|end| *end <= length) else { break };
+        match head[0] {
+            // What comes then is an index, or the end.
+            op::DATA_END | op::FOOTER | 0 => break,
+            op::CHUNK => {
+                // A chunk's record begins with its two times.
+                let mut times = [[0; 8]; 2];
+                if record < 16 {
+                    break;
+                }
+                for time in &mut times {
+                    file.read_exact(time)?;
+                }
+                let [start, end_time] = times.map(u64::from_le_bytes);
+                chunks.push(ChunkPlace { offset: at, length: end - at, start, end: end_time });
+            }
+            _ => {}
+        }
+        at = end;
+    }
+    Ok((chunks, at))
+}
