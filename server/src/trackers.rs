@@ -7,6 +7,7 @@
 mod eyes;
 pub(crate) mod fake;
 pub mod fmv3;
+pub mod fuzz;
 pub mod ifacialmocap;
 pub(crate) mod listen;
 pub mod livelink;
