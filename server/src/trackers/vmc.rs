@@ -14,6 +14,8 @@ use rosc::{OscBundle, OscMessage, OscPacket, OscTime, OscType, encoder};
 pub const LARGEST: usize = 16 << 10;
 /// Largest bundle that is written, bytes.
 pub const LARGEST_WRITTEN: usize = 1500;
+/// Datagrams of a face without a word that it is complete, after which a sender is taken to be one that never says it.
+const UNTOLD: u32 = 8;
 /// Time of a sender's own clock from which an `f32` no longer tells 120 frames a second apart.
 const LATEST_TIME: f32 = 16_384.0;
 
@@ -56,8 +58,10 @@ pub struct Reader {
     time: Option<f32>,
     /// A frame has come without the clock: it cannot be relied on.
     lacks_time: bool,
-    /// Faces are complete when the sender says so; others when their datagram ends.
+    /// Faces are complete when the sender says so; of one that never does when their datagram ends.
     sends_apply: bool,
+    /// Datagrams of a face in which it has not said so, up to [`UNTOLD`].
+    num_untold: u32,
     /// Something about the face has come since the last frame.
     has_news: bool,
     /// The sender has said that the face is complete.
@@ -77,6 +81,7 @@ impl Default for Reader {
             time: None,
             lacks_time: false,
             sends_apply: false,
+            num_untold: 0,
             has_news: false,
             is_complete: false,
         }
@@ -91,7 +96,10 @@ impl Reader {
         }
         let mut next = self.clone();
         osc::messages(bytes, |message| next.read(&message))?;
-        let is_complete = next.is_complete || (!next.sends_apply && next.has_news);
+        if next.has_news && !next.sends_apply {
+            next.num_untold = (next.num_untold + 1).min(UNTOLD);
+        }
+        let is_complete = next.is_complete || (next.has_news && next.num_untold == UNTOLD);
         *self = next;
         Ok(is_complete.then(|| self.complete()))
     }
@@ -101,7 +109,7 @@ impl Reader {
         match (message.addr.as_str(), message.args.as_slice()) {
             ("/VMC/Ext/Blend/Val", [OscType::String(name), OscType::Float(value), ..]) => self.set(name, *value),
             ("/VMC/Ext/Blend/Apply", _) => {
-                self.sends_apply = true;
+                (self.sends_apply, self.num_untold) = (true, 0);
                 self.is_complete = self.has_news;
                 Ok(())
             }
@@ -260,6 +268,10 @@ mod tests {
         })
     }
 
+    fn apply() -> OscPacket {
+        OscPacket::Message(OscMessage { addr: "/VMC/Ext/Blend/Apply".into(), args: vec![] })
+    }
+
     fn bone(name: &str, q: [f32; 4]) -> OscPacket {
         let args = [OscType::String(name.into())].into_iter().chain([0.0; 3].into_iter().chain(q).map(OscType::Float)).collect();
         OscPacket::Message(OscMessage { addr: "/VMC/Ext/Bone/Pos".into(), args })
@@ -283,8 +295,11 @@ mod tests {
         let seen = reader.take(&bundle(vec![OscPacket::Message(OscMessage { addr: "/VMC/Ext/Blend/Apply".into(), args: vec![] })]));
         let seen = seen.unwrap().unwrap();
         assert_eq!((of(&seen, "jawOpen"), of(&seen, "mouthSmileLeft")), (0.5, 0.0), "with ARKit's names the VRM ones count no more");
-        // One that never does gives a face a datagram.
+        // One that never does gives a face a datagram, once that is clear.
         let mut reader = Reader::default();
+        for _ in 1..UNTOLD {
+            assert_eq!(reader.take(&bundle(vec![value("browInnerUp", 0.5)])), Ok(None));
+        }
         let seen = reader.take(&bundle(vec![value("browInnerUp", 0.25), value("tongueOut", 3.0)])).unwrap().unwrap();
         assert_eq!((of(&seen, "browInnerUp"), of(&seen, "tongueOut")), (0.25, 1.2));
         assert_eq!(reader.take(&bundle(vec![bone("Hips", [0.0, 0.0, 0.0, 1.0])])).unwrap(), None, "nothing of a face");
@@ -304,6 +319,7 @@ mod tests {
             bone("LeftEye", [0.0, s, 0.0, c]),
             bone("RightEye", [0.0, s, 0.0, c]),
             value("jawOpen", 0.1),
+            apply(),
         ]);
         let seen = reader.take(&packet).unwrap().unwrap();
         assert!((of(&seen, "eyeLookInLeft") - 0.5).abs() < 1e-5 && (of(&seen, "eyeLookOutRight") - 0.5).abs() < 1e-5);
@@ -319,12 +335,9 @@ mod tests {
         let bundles = write(12.5, Some(&weights), head);
         assert!(bundles.iter().all(|bundle| bundle.len() <= LARGEST_WRITTEN) && bundles.len() == 2, "{}", bundles.len());
         let mut reader = Reader::default();
-        // A first face teaches the reader that this sender says when it is complete.
-        let mut seen = Vec::new();
-        for bundle in bundles.iter().chain(&bundles) {
-            seen.extend(reader.take(bundle).unwrap());
-        }
-        let last = seen.pop().unwrap();
+        let seen: Vec<_> = bundles.iter().flat_map(|bundle| reader.take(bundle).unwrap()).collect();
+        assert_eq!((seen.len(), seen[0].time), (1, Some(12.5)), "two datagrams are one face");
+        let last = seen[0].clone();
         assert_eq!(of(&last, "tongueOut"), 51.0 / 64.0);
         let Sight::Weights(last) = last.sight else { panic!("weights") };
         assert_eq!(*last.weights, weights);
@@ -358,8 +371,8 @@ mod tests {
         let at = |time| OscPacket::Message(OscMessage { addr: "/VMC/Ext/T".into(), args: vec![OscType::Float(time)] });
         let mut reader = Reader::default();
         let mut time = |packets| reader.take(&bundle(packets)).unwrap().unwrap().time;
-        assert_eq!(time(vec![at(1.5), value("jawOpen", 0.1)]), Some(1.5));
-        assert_eq!(time(vec![value("jawOpen", 0.2)]), None);
-        assert_eq!(time(vec![at(2.0), value("jawOpen", 0.1)]), None);
+        assert_eq!(time(vec![at(1.5), value("jawOpen", 0.1), apply()]), Some(1.5));
+        assert_eq!(time(vec![value("jawOpen", 0.2), apply()]), None);
+        assert_eq!(time(vec![at(2.0), value("jawOpen", 0.1), apply()]), None);
     }
 }
