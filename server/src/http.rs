@@ -25,6 +25,7 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
         .route("/metrics", get(metrics))
         .route("/api/rooms", get(rooms))
         .route("/api/rooms/{room}/record/{action}", post(record))
+        .route("/api/trackers", get(trackers))
         .route("/characters/{file}", get(character))
         .route("/v1/rooms/{room}/publish", get(publish_socket))
         .route("/v1/rooms/{room}/view", get(view_socket))
@@ -153,6 +154,10 @@ async fn record(State(hub): State<Arc<Hub>>, Path((room, action)): Path<(String,
         },
         _ => ErrorMessage::new("not_found", "expected record/start or record/stop").response(StatusCode::NOT_FOUND),
     }
+}
+
+async fn trackers(State(hub): State<Arc<Hub>>) -> Response {
+    axum::Json(serde_json::json!({ "ports": hub.trackers.list() })).into_response()
 }
 
 async fn character(State(hub): State<Arc<Hub>>, Path(file): Path<String>, headers: HeaderMap) -> Response {

@@ -1,11 +1,15 @@
-//! The server's command line: `serve` and `send`.
+//! The server's command line: `serve`, `send` and `fake`.
 
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use rhytid_server::recording::{RecordConfig, Recording, VerifyReport, verify};
-use rhytid_server::{Access, Clip, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, bind, load_character, run, send};
+use rhytid_server::{
+    Access, Clip, FakeKind, FakeOptions, Limits, ListenSpec, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, VmcOutSpec, bind,
+    fake, load_character, run, send,
+};
 use std::io::Write;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -34,6 +38,8 @@ enum Command {
     Send(SendArgs),
     /// Solve a recording again and compare every packet, byte by byte.
     Verify(VerifyArgs),
+    /// Play another program's tracker from a feed file, to try its protocol without it.
+    Fake(FakeArgs),
 }
 
 #[derive(Args)]
@@ -57,6 +63,14 @@ struct ServeArgs {
     /// Settings; flags given besides win.
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
+    /// A port for other programs' trackers, PROTOCOL one of any, openseeface, livelink, ifacialmocap, fmv3, vmc and vts; options
+    /// room=NAME|subject, slot=NAME, priority=0..100, groups=brows+lids+gaze+mouth+head, allow=IP, phone=IP:PORT,
+    /// version=1|2|3|facemotion3d, swap_jaw=BOOL, swap_mouth=BOOL (repeat for several).
+    #[arg(long, value_name = "PROTOCOL=IP:PORT[,OPTION=VALUE…]")]
+    listen_udp: Vec<ListenSpec>,
+    /// A program that gets a room's face as VMC (repeat for several).
+    #[arg(long, value_name = "IP:PORT[,room=NAME]")]
+    vmc_out: Vec<VmcOutSpec>,
     #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
@@ -98,6 +112,35 @@ struct SendArgs {
     timeout: Duration,
 }
 
+#[derive(Args)]
+struct FakeArgs {
+    /// The feed file: weights, or landmarks, from which weights are told where the protocol has weights.
+    #[arg(value_name = "FEED")]
+    feed: PathBuf,
+    /// Whom to play.
+    #[arg(long = "as", value_name = "SENDER")]
+    kind: FakeKind,
+    /// Where to send to; without, to whoever asks for it (ifacialmocap, facemotion3d, fmv3, vts).
+    #[arg(long, value_name = "IP:PORT")]
+    to: Option<SocketAddr>,
+    /// Where to send from and to be asked at; port 0 takes a free one.
+    #[arg(long, default_value = "0.0.0.0:0", value_name = "IP:PORT")]
+    bind: SocketAddr,
+    /// What the performer is called, where the protocol says it.
+    #[arg(long, default_value = "Fake", value_parser = parse_subject)]
+    subject: String,
+    /// Feed seconds a second, or `max`.
+    #[arg(long, default_value = "1.0", value_parser = parse_speed)]
+    speed: f64,
+    /// Play it again and again.
+    #[arg(long = "loop")]
+    repeats: bool,
+}
+
+fn parse_subject(text: &str) -> Result<String, String> {
+    if text.len() <= 256 { Ok(text.to_owned()) } else { Err("expected at most 256 bytes".into()) }
+}
+
 fn parse_speed(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         _ if text == "max" => Ok(f64::INFINITY),
@@ -123,6 +166,7 @@ async fn main() -> ExitCode {
         Command::Serve(args) => serve(*args, matches.subcommand_matches("serve")).await,
         Command::Send(args) => send_feed(args).await,
         Command::Verify(args) => verify_file(&args),
+        Command::Fake(args) => fake_feed(args).await,
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -180,6 +224,8 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "max-recording": record.file_bytes,
     }
     config.character = args.character.or(config.character);
+    config.listen_udp.extend(args.listen_udp);
+    config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);
     config.access.origins.extend(args.access.origins);
     config.validate()?;
@@ -290,5 +336,25 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
     let SendReport { frames, errors } = report?;
     ensure!(errors == 0, "sent {frames} frames, of all messages the server refused {errors}");
     eprintln!("sent {frames} frames, none refused");
+    Ok(())
+}
+
+async fn fake_feed(args: FakeArgs) -> anyhow::Result<()> {
+    let options = FakeOptions {
+        kind: args.kind,
+        feed: args.feed,
+        to: args.to,
+        bind: args.bind,
+        subject: args.subject,
+        speed: args.speed,
+        repeats: args.repeats,
+    };
+    let mut interrupt = Signals::new().context("cannot wait for signals")?;
+    let tell = |address: SocketAddr| match options.to {
+        Some(to) => eprintln!("sending from udp {address} to {to}"),
+        None => eprintln!("waiting on udp {address} to be asked"),
+    };
+    let frames = fake(&options, tell, async move { interrupt.wait().await }).await?;
+    eprintln!("sent {frames} frames");
     Ok(())
 }

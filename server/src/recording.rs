@@ -6,6 +6,7 @@
 
 mod format;
 mod reader;
+pub(crate) mod text;
 mod verify;
 mod writer;
 

@@ -289,7 +289,7 @@ impl Room {
     }
 
     /// Records into `sink` from now on. A publisher that is there is noted as under way, with the state that its packets refer to.
-    pub fn record_into(&self, sink: Arc<Sink>, solve: &SolveConfig) -> Result<RecorderStatus, RecordError> {
+    pub fn record_into(&self, sink: Arc<Sink>, solve: &SolveConfig) -> Result<(), RecordError> {
         let mut state = lock(&self.state);
         if state.recording.as_ref().is_some_and(|sink| !sink.has_ended()) {
             return Err(RecordError::Running);
@@ -307,9 +307,13 @@ impl Room {
                 sink.put(Item::Packet(key.bytes.clone()));
             }
         }
-        let status = sink.status();
         state.recording = Some(sink);
-        Ok(status)
+        Ok(())
+    }
+
+    /// How its recording stands.
+    pub fn recording(&self) -> Option<RecorderStatus> {
+        lock(&self.state).recording.as_ref().map(|sink| sink.status())
     }
 
     /// Ends the recording; its file is finished by its own thread.
@@ -380,12 +384,20 @@ impl Publishing {
         }
     }
 
-    /// Makes `calibration` the neutral face that the room keeps, unless a later session has left one or it is kept already.
-    pub fn keep_neutral(&self, hello: &PublishHello, calibration: &Calibration) {
+    /// True while what happens in the room is recorded.
+    pub fn is_recorded(&self) -> bool {
+        self.room.is_recorded()
+    }
+
+    /// Makes `calibration` the neutral face that the room keeps, unless a later session has left one or it is kept already; true
+    /// where that changed it.
+    pub fn keep_neutral(&self, hello: &PublishHello, calibration: &Calibration) -> bool {
         let mut state = lock(&self.room.state);
-        if state.neutral.as_ref().is_none_or(|kept| kept.session <= self.session && kept.calibration != *calibration) {
+        let is_new = state.neutral.as_ref().is_none_or(|kept| kept.session <= self.session && kept.calibration != *calibration);
+        if is_new {
             state.neutral = Some(Neutral { session: self.session, hello: hello.clone(), calibration: calibration.clone() });
         }
+        is_new
     }
 }
 

@@ -7,6 +7,8 @@ use crate::recording::{RecordError, Recorder, RecorderStatus};
 use crate::room::{Room, Rooms};
 use crate::socket::{ErrorMessage, say_and_close};
 use crate::stream::TimedStream;
+use crate::trackers::listen::{self, Port, Trackers};
+use crate::trackers::vmc_out::{self, VmcOut};
 use axum::extract::Request;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use rhytid_shared::packet::PacketLayout;
@@ -83,6 +85,7 @@ pub(crate) struct Hub {
     pub layout: PacketLayout,
     pub rooms: Rooms,
     pub recorder: Recorder,
+    pub trackers: Trackers,
     pub metrics: Arc<Metrics>,
     pub listens_on_loopback: bool,
     /// True once the service ends.
@@ -93,24 +96,28 @@ pub(crate) struct Hub {
     refusals: Arc<Semaphore>,
 }
 
-/// Begins a recording of `room`, which ends with the room or when it is told to.
+/// Begins a recording of `room`, which ends with the room or when it is told to. Done once its file is there.
 pub(crate) async fn record(hub: &Arc<Hub>, room: &Arc<Room>) -> Result<RecorderStatus, RecordError> {
     if room.is_recorded() {
         return Err(RecordError::Running);
     }
-    let (hub, room) = (hub.clone(), room.clone());
+    let (sink, made) = hub.recorder.start(&room.name, hub.tasks.clone())?;
+    room.record_into(sink, &hub.config.solve)?;
     // A disk may take its time to make a file.
-    let begin = move || {
-        let sink = hub.recorder.start(&room.name, hub.tasks.clone())?;
-        room.record_into(sink, &hub.config.solve)
-    };
-    tokio::task::spawn_blocking(begin).await.expect("making a recording does not panic")
+    let made = tokio::task::spawn_blocking(move || made.recv()).await;
+    if let Ok(Ok(Err(error))) = made {
+        return Err(error);
+    }
+    room.recording().ok_or(RecordError::NoFolder)
 }
 
-/// Begins the recording of a room that is recorded without being asked to, unless there is one.
-pub(crate) async fn record_by_itself(hub: &Arc<Hub>, room: &Arc<Room>) {
-    if hub.recorder.is_automatic(&room.name)
-        && let Err(error) = record(hub, room).await
+/// Begins the recording of a room that is recorded without being asked to, unless there is one. Waits for nothing.
+pub(crate) fn record_by_itself(hub: &Hub, room: &Arc<Room>) {
+    if !hub.recorder.is_automatic(&room.name) || room.is_recorded() {
+        return;
+    }
+    let begun = hub.recorder.start(&room.name, hub.tasks.clone()).and_then(|(sink, _)| room.record_into(sink, &hub.config.solve));
+    if let Err(error) = begun
         && !matches!(error, RecordError::Running)
     {
         hub.metrics.recording_failures.inc();
@@ -153,6 +160,13 @@ pub async fn run(
 ) -> Result<(), ServerError> {
     config.validate()?;
     let address = listener.local_addr().map_err(|source| ServerError::Listen { address: config.listen.clone(), source })?;
+    let (mut ports, mut outs) = (Vec::new(), Vec::new());
+    for spec in &config.listen_udp {
+        ports.push(Port::bind(spec).await?);
+    }
+    for spec in &config.vmc_out {
+        outs.push(VmcOut::bind(spec).await?);
+    }
     let metrics = Arc::new(Metrics::new());
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
@@ -164,6 +178,7 @@ pub async fn run(
         hello_character,
         layout,
         rooms: Rooms::new(config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
+        trackers: Trackers::default(),
         listens_on_loopback: address.ip().is_loopback(),
         character,
         glb: glb.into(),
@@ -177,6 +192,8 @@ pub async fn run(
     });
     let app = router(hub.clone());
     tracing::info!(%address, character = hub.character.name, "serving");
+    listen::start(&hub, ports);
+    vmc_out::start(&hub, outs);
     tokio::pin!(shutdown);
     let mut sweep = tokio::time::interval(SWEEP_INTERVAL.min(seconds(hub.config.timeouts.room_idle)));
     loop {

@@ -7,7 +7,7 @@ use crate::solve::{Calibration, SolveConfig};
 use rhytid_shared::packet::{BatchReader, Decoder};
 use rhytid_shared::view::CharacterHello;
 use rhytid_shared::{ARKIT_NAMES, Character, FaceFrame, PublishMessage, PublishReader, TrackingFrame};
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
 
@@ -134,6 +134,7 @@ pub fn verify(recording: &mut Recording, character: &Arc<Character>) -> Result<V
         solved_stream: Stream::new(character),
         report: VerifyReport::default(),
         frame: TrackingFrame::default(),
+        ended: BTreeSet::new(),
     };
     let is_cut = recording.cut_off().is_some();
     for index in 0..recording.chunks().len() {
@@ -167,6 +168,8 @@ struct Run<'a> {
     solved_stream: Stream,
     report: VerifyReport,
     frame: TrackingFrame,
+    /// Sessions whose end is recorded.
+    ended: BTreeSet<u32>,
 }
 
 impl Run<'_> {
@@ -199,6 +202,9 @@ impl Run<'_> {
             SessionEvent::Gap { messages } => {
                 let (seconds, frames) = (self.seconds(entry), self.report.frames);
                 return Err(VerifyError::Gap { seconds, messages, frames });
+            }
+            SessionEvent::End { session, .. } => {
+                self.ended.insert(session);
             }
             _ => {}
         }
@@ -267,7 +273,10 @@ impl Run<'_> {
     fn end(mut self, is_cut: bool) -> Result<VerifyReport, VerifyError> {
         for (session, solved) in &self.solved {
             self.report.cut += solved.len() as u64;
-            if !is_cut && let Some(packet) = solved.front() {
+            if !is_cut
+                && self.ended.contains(session)
+                && let Some(packet) = solved.front()
+            {
                 let seq = self.solved_stream.take(packet).map_or(0, |frame| frame.seq);
                 return Err(VerifyError::Unmatched { session: *session, seq, problem: "a message gives a packet that did not go out" });
             }

@@ -23,8 +23,9 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use tokio::sync::mpsc;
 use tokio_tungstenite::tungstenite::{Bytes, Utf8Bytes};
 
 /// A chunk is open no longer than this: with the time to write it, less than the second that may be lost.
@@ -175,47 +176,67 @@ impl Recorder {
         self.config.is_automatic(room)
     }
 
-    /// Begins a recording of `room`. Makes a file, so it may take as long as the disk does.
-    pub fn start(&self, room: &RoomName, keeps: tokio::sync::mpsc::Sender<Infallible>) -> Result<Arc<Sink>, RecordError> {
-        let dir = self.config.dir.as_deref().ok_or(RecordError::NoFolder)?;
+    /// Begins a recording of `room`; the file is made by a thread of its own, which tells once that is done.
+    pub fn start(&self, room: &RoomName, keeps: mpsc::Sender<Infallible>) -> Result<(Arc<Sink>, Made), RecordError> {
+        let dir = self.config.dir.clone().ok_or(RecordError::NoFolder)?;
         let place = Running::take(&self.num_running, self.config.recordings, &self.metrics)?;
-        let (file, path) = create(dir, room)?;
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let (queue, items) = sync_channel(QUEUE);
+        let (made, is_made) = sync_channel(1);
         let shared = Arc::new(Shared::default());
-        let sink = Sink { name, started: Clock::now(), queue, shared: shared.clone(), metrics: self.metrics.clone() };
-        let mut writer = RecordingWriter::new(file, self.layout.clone(), self.config.file_bytes)?;
-        writer.event(
-            sink.started.unix_nanos,
-            &SessionEvent::Recording {
-                version: VERSION,
-                room: room.to_string(),
-                server: env!("CARGO_PKG_VERSION").into(),
-                character: Box::new(self.character.clone()),
-            },
-        )?;
-        let metrics = self.metrics.clone();
-        let thread = std::thread::Builder::new().name(format!("record {room}"));
-        let shown = path.display().to_string();
+        let started = Clock::now();
+        let sink = Sink { started, queue, shared: shared.clone(), metrics: self.metrics.clone() };
+        let begin = SessionEvent::Recording {
+            version: VERSION,
+            room: room.to_string(),
+            server: env!("CARGO_PKG_VERSION").into(),
+            character: Box::new(self.character.clone()),
+        };
+        let (layout, most_bytes, metrics, room) = (self.layout.clone(), self.config.file_bytes, self.metrics.clone(), room.clone());
+        let open = move |shared: &Shared| {
+            let (file, path) = create(&dir, &room)?;
+            *lock(&shared.file) = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            tracing::info!(file = %path.display(), "recording");
+            let mut writer = RecordingWriter::new(file, layout, most_bytes)?;
+            writer.event(started.unix_nanos, &begin)?;
+            Ok::<_, RecordError>(writer)
+        };
         let run = move || {
-            tracing::info!(file = %shown, "recording");
-            let ended = write_all(&items, writer, &shared, &metrics);
+            let ended = match open(&shared) {
+                Ok(writer) => {
+                    let _ = made.send(Ok(()));
+                    write_all(&items, writer, &shared, &metrics).map_err(|error| error.to_string())
+                }
+                Err(error) => {
+                    let told = error.to_string();
+                    let _ = made.send(Err(error));
+                    Err(told)
+                }
+            };
             // What still comes is let go, and the room told.
             drop(items);
+            let file = lock(&shared.file).clone();
             match &ended {
-                Ok(()) => tracing::info!(file = %shown, "recording ended"),
+                Ok(()) => tracing::info!(file, "recording ended"),
                 Err(error) => {
                     metrics.recording_failures.inc();
-                    tracing::error!(file = %shown, %error, "recording failed; the stream goes on");
+                    tracing::error!(file, error, "recording failed; the stream goes on");
                 }
             }
-            *shared.end.lock().unwrap_or_else(PoisonError::into_inner) =
-                Some(ended.err().map_or_else(String::new, |error| error.to_string()));
+            *lock(&shared.end) = Some(ended.err().unwrap_or_default());
             drop((place, keeps));
         };
-        thread.spawn(run).map_err(|source| RecordError::Create { path: path.display().to_string(), source })?;
-        Ok(Arc::new(sink))
+        let thread = std::thread::Builder::new().name("recording".into());
+        thread.spawn(run).map_err(|source| RecordError::Create { path: "a thread".into(), source })?;
+        Ok((Arc::new(sink), is_made))
     }
+}
+
+/// Told once a recording's file is there, or why it is not.
+pub(crate) type Made = Receiver<Result<(), RecordError>>;
+
+/// What stands under these locks is whole at each step.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// A place among the recordings at a time.
@@ -300,13 +321,14 @@ struct Shared {
     /// Left out since the thread was last told.
     gap: AtomicU64,
     dropped: AtomicU64,
+    /// Name of the file, once there is one.
+    file: Mutex<String>,
     /// Why it has ended; empty where it was told to.
     end: Mutex<Option<String>>,
 }
 
 /// The room's end of a recording. The file is finished when the last of these is dropped.
 pub(crate) struct Sink {
-    name: String,
     started: Clock,
     queue: SyncSender<(u64, Item)>,
     shared: Arc<Shared>,
@@ -338,16 +360,16 @@ impl Sink {
 
     /// True where nothing is written any more.
     pub fn has_ended(&self) -> bool {
-        self.shared.end.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+        lock(&self.shared.end).is_some()
     }
 
     pub fn status(&self) -> RecorderStatus {
         RecorderStatus {
-            file: self.name.clone(),
+            file: lock(&self.shared.file).clone(),
             seconds: self.started.at.elapsed().as_secs_f64(),
             bytes: self.shared.bytes.load(Ordering::Relaxed),
             dropped: self.shared.dropped.load(Ordering::Relaxed),
-            error: self.shared.end.lock().unwrap_or_else(PoisonError::into_inner).clone().filter(|error| !error.is_empty()),
+            error: lock(&self.shared.end).clone().filter(|error| !error.is_empty()),
         }
     }
 }
