@@ -1,6 +1,7 @@
 //! What a user may set: the listening address, the character, every limit and every time-out.
 
 use crate::recording::RecordConfig;
+use crate::service::Play;
 use crate::solve::SolveConfig;
 use crate::trackers::spec::{ListenSpec, VmcOutSpec};
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
@@ -67,6 +68,9 @@ pub struct ServerConfig {
     pub access: Access,
     /// Recordings.
     pub record: RecordConfig,
+    /// A recording that is played from the start; not in files.
+    #[serde(skip)]
+    pub play: Option<Play>,
     /// The solve.
     pub solve: SolveConfig,
 }
@@ -82,6 +86,7 @@ impl Default for ServerConfig {
             timeouts: Timeouts::default(),
             access: Access::default(),
             record: RecordConfig::default(),
+            play: None,
             solve: SolveConfig::default(),
         }
     }

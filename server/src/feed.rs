@@ -1,5 +1,7 @@
-//! Feed files: the publish messages of one session, one a line (`.jsonl`), or a recording of Live Link Face (`.csv`).
+//! Feed files: the publish messages of one session, one a line (`.jsonl`), a recording of Live Link Face (`.csv`), or one of
+//! our own (`.mcap`).
 
+use crate::recording::RecordedFeed;
 use crate::trackers::livelink_csv::LiveLinkCsv;
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
@@ -155,6 +157,11 @@ fn open(path: &Path) -> Result<(FeedLines, String), FeedError> {
     let shown = path.display().to_string();
     let file = File::open(path).map_err(|source| FeedError::Io { path: shown.clone(), source })?;
     let lines = BufReader::with_capacity(1 << 16, file);
+    let has_ending = |ending: &str| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(ending));
+    if has_ending("mcap") {
+        let feed = RecordedFeed::open(path).map_err(|error| FeedError::Io { path: shown.clone(), source: std::io::Error::other(error) })?;
+        return Ok((Box::new(feed), shown));
+    }
     let is_recording = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("csv"));
     Ok((if is_recording { Box::new(BufReader::new(LiveLinkCsv::new(lines))) } else { Box::new(lines) }, shown))
 }

@@ -1,7 +1,7 @@
 //! What is asked for over HTTP: pages, listings, the character, and the two kinds of WebSocket.
 
 use crate::config::Access;
-use crate::recording::{RecordError, RecorderStatus};
+use crate::recording::{PlayError, PlayRequest, RecordError, RecorderStatus};
 use crate::service::{self, Hub, Peer};
 use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
 use crate::{publish, viewer};
@@ -25,6 +25,8 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
         .route("/metrics", get(metrics))
         .route("/api/rooms", get(rooms))
         .route("/api/rooms/{room}/record/{action}", post(record))
+        .route("/api/recordings", get(recordings))
+        .route("/api/rooms/{room}/replay", get(replay_status).post(replay).delete(end_replay))
         .route("/api/trackers", get(trackers))
         .route("/characters/{file}", get(character))
         .route("/v1/rooms/{room}/publish", get(publish_socket))
@@ -153,6 +155,81 @@ async fn record(State(hub): State<Arc<Hub>>, Path((room, action)): Path<(String,
             None => ErrorMessage::new("not_recording", "the room is not being recorded").response(StatusCode::CONFLICT),
         },
         _ => ErrorMessage::new("not_found", "expected record/start or record/stop").response(StatusCode::NOT_FOUND),
+    }
+}
+
+/// The recordings in the server's folder, newest first.
+async fn recordings(State(hub): State<Arc<Hub>>) -> Response {
+    let Some(dir) = hub.recorder.dir().map(std::path::Path::to_owned) else {
+        return axum::Json(serde_json::json!({ "recordings": [], "enabled": false })).into_response();
+    };
+    let list = move || {
+        let mut files: Vec<(std::time::SystemTime, String, u64)> = std::fs::read_dir(dir)
+            .into_iter()
+            .flatten()
+            .flatten()
+            .filter_map(|entry| {
+                let name = entry.file_name().into_string().ok().filter(|name| name.ends_with(".mcap"))?;
+                let file = entry.metadata().ok()?;
+                Some((file.modified().ok()?, name, file.len()))
+            })
+            .collect();
+        files.sort_by(|a, b| b.cmp(a));
+        files.truncate(MOST_LISTED);
+        files
+    };
+    let files = tokio::task::spawn_blocking(list).await.unwrap_or_default();
+    let files: Vec<_> = files.into_iter().map(|(_, file, bytes)| serde_json::json!({ "file": file, "bytes": bytes })).collect();
+    axum::Json(serde_json::json!({ "recordings": files, "enabled": true })).into_response()
+}
+
+/// What a page can show of a folder of recordings.
+const MOST_LISTED: usize = 1000;
+
+async fn replay_status(State(hub): State<Arc<Hub>>, Path(room): Path<String>) -> Response {
+    match room_name(&room) {
+        Ok(room) => axum::Json(serde_json::json!({ "replay": hub.players.status(&room) })).into_response(),
+        Err(error) => error.response(StatusCode::BAD_REQUEST),
+    }
+}
+
+/// Plays a recording into the room, or tells its player what to do.
+async fn replay(State(hub): State<Arc<Hub>>, Path(room): Path<String>, body: Bytes) -> Response {
+    let room = match room_name(&room) {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    let request: PlayRequest = match serde_json::from_slice(&body) {
+        Ok(request) => request,
+        Err(error) => return ErrorMessage::new("bad_replay", format!("body: {error}")).response(StatusCode::BAD_REQUEST),
+    };
+    // Opening a recording reads its index.
+    match tokio::task::spawn_blocking(move || hub.players.request(&hub, &room, request)).await {
+        Ok(Ok(status)) => axum::Json(serde_json::json!({ "replay": status })).into_response(),
+        Ok(Err(error)) => {
+            let (code, status) = match error {
+                PlayError::Read(_) => ("bad_recording", StatusCode::UNPROCESSABLE_ENTITY),
+                PlayError::Character { .. } => ("other_character", StatusCode::CONFLICT),
+                PlayError::NoPlayer => ("not_playing", StatusCode::CONFLICT),
+                PlayError::NoFolder => ("no_recordings", StatusCode::FORBIDDEN),
+                PlayError::File { .. } => ("no_such_recording", StatusCode::NOT_FOUND),
+                PlayError::Range { .. } => ("bad_replay", StatusCode::BAD_REQUEST),
+                PlayError::TooMany => ("too_many_players", StatusCode::SERVICE_UNAVAILABLE),
+                PlayError::Room(_) => ("room_taken", StatusCode::CONFLICT),
+            };
+            ErrorMessage::new(code, error.to_string()).response(status)
+        }
+        Err(_) => ErrorMessage::new("bad_recording", "it could not be read").response(StatusCode::INTERNAL_SERVER_ERROR),
+    }
+}
+
+async fn end_replay(State(hub): State<Arc<Hub>>, Path(room): Path<String>) -> Response {
+    match room_name(&room) {
+        Ok(room) => match hub.players.stop(&room) {
+            Some(status) => axum::Json(serde_json::json!({ "replay": status })).into_response(),
+            None => ErrorMessage::new("not_playing", "nothing is played in this room").response(StatusCode::CONFLICT),
+        },
+        Err(error) => error.response(StatusCode::BAD_REQUEST),
     }
 }
 

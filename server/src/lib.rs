@@ -27,6 +27,6 @@ mod viewer;
 pub use clip::{Clip, ClipError, ClipReader};
 pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts};
 pub use send::{SendError, SendOptions, SendReport, SendSource, send};
-pub use service::{ServerError, bind, load_character, run};
+pub use service::{Play, ServerError, bind, load_character, run};
 pub use trackers::fake::{FakeError, FakeKind, FakeOptions, fake};
 pub use trackers::spec::{ListenSpec, RoomRule, SpecError, VmcOutSpec};

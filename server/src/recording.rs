@@ -1,17 +1,31 @@
 //! Recordings: what a room's publishers sent, what the server made of it, and the packets that went out, in one MCAP file that can
 //! be played, solved again and compared.
 //!
-//! `format` says what stands in a file, `writer` writes it beside the live stream and never holds it up, `reader` reads any bytes
-//! that claim to be one. The rest works on files: `verify`, `recover`, `player`, `export`.
+//! `format` says what stands in a file, `writer` writes it beside the live stream and never holds it up, `viewer` from another
+//! machine; `reader` reads any bytes that claim to be one, `faces` and `feed` what is in it. The rest works on files: `verify`,
+//! `recover`, `player`, `export`.
 
+mod export;
+mod faces;
+mod feed;
 mod format;
+mod player;
 mod reader;
+mod recover;
 pub(crate) mod text;
 mod verify;
+mod viewer;
 mod writer;
 
+pub use export::{ExportError, export_csv, export_gltf};
+pub use faces::{Faces, Moment};
+pub use feed::RecordedFeed;
 pub use format::{Entry, SessionEvent, Topic};
-pub use reader::{ReadError, Recording};
+pub(crate) use player::Players;
+pub use player::{PlayError, PlayRequest, PlayStatus};
+pub use reader::{ChunkPlace, ReadError, Recording};
+pub use recover::{RecoverError, RecoverReport, recover};
 pub use verify::{Difference, VerifyError, VerifyReport, verify};
-pub(crate) use writer::{Item, RecordError, Recorder, RecorderStatus, Sink};
-pub use writer::{RecordConfig, RecordingWriter};
+pub use viewer::{WatchError, watch};
+pub(crate) use writer::{Item, Recorder, RecorderStatus, Sink};
+pub use writer::{RecordConfig, RecordError, RecordingWriter};

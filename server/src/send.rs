@@ -2,6 +2,7 @@
 
 use crate::clip::Clip;
 use crate::feed::{Feed, FeedError, FeedItem};
+use crate::recording::{ReadError, RecordedFeed, Recording};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use indicatif::ProgressBar;
@@ -34,6 +35,9 @@ pub enum SendError {
     /// The feed is broken.
     #[error(transparent)]
     Feed(#[from] FeedError),
+    /// The recording is broken, or has nothing to send.
+    #[error(transparent)]
+    Recording(#[from] ReadError),
     /// The server could not be reached, or refused the connection.
     #[error("cannot connect to {url}: {problem}")]
     Connect {
@@ -59,6 +63,9 @@ pub enum SendSource {
     Text(String, String),
     /// An animation clip, and what to call it.
     Clip(Arc<Clip>, String),
+    /// What the publishers of a recording sent, one session after the other, from the first time to the second, seconds since the
+    /// recording began.
+    Recording(PathBuf, [f64; 2]),
 }
 
 /// What to send, where to and how.
@@ -107,6 +114,26 @@ pub async fn send(options: &SendOptions, progress: &ProgressBar, stop: impl Futu
                 progress.set_length(text.len() as u64);
                 let feed = Feed::new_for_any_character(Cursor::new(text.as_bytes()), name.clone())?;
                 send_once(feed, options, progress, &mut report, stop.as_mut()).await?
+            }
+            SendSource::Recording(path, range) => {
+                progress.set_length(std::fs::metadata(path).map_or(0, |file| file.len()));
+                let mut ending = Ending::Sent;
+                for index in 0.. {
+                    let shown = path.display().to_string();
+                    let feed = RecordedFeed::session(Recording::open(path)?, index, *range)?;
+                    let Ok(feed) = feed else {
+                        if index == 0 {
+                            let problem = "it has no publisher's messages from their beginning: play its packets with --packets".into();
+                            return Err(ReadError::Broken { path: shown, problem }.into());
+                        }
+                        break;
+                    };
+                    ending = send_once(Feed::new_for_any_character(feed, shown)?, options, progress, &mut report, stop.as_mut()).await?;
+                    if ending == Ending::Stopped {
+                        break;
+                    }
+                }
+                ending
             }
             SendSource::Clip(clip, name) => {
                 progress.set_length(clip.num_bytes());

@@ -3,7 +3,7 @@
 use crate::config::{Limits, ServerConfig, ServerConfigError, seconds};
 use crate::http::router;
 use crate::metrics::Metrics;
-use crate::recording::{RecordError, Recorder, RecorderStatus};
+use crate::recording::{PlayError, PlayRequest, Players, RecordError, Recorder, RecorderStatus};
 use crate::room::{Room, Rooms};
 use crate::socket::{ErrorMessage, say_and_close};
 use crate::stream::TimedStream;
@@ -60,6 +60,9 @@ pub enum ServerError {
         /// What is wrong with it.
         source: CharacterError,
     },
+    /// The recording could not be played.
+    #[error(transparent)]
+    Play(PlayError),
     /// The address could not be listened on.
     #[error("cannot listen on {address}: {source}")]
     Listen {
@@ -68,6 +71,17 @@ pub enum ServerError {
         /// What the system said.
         source: std::io::Error,
     },
+}
+
+/// A recording that is played from the start.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Play {
+    /// The recording.
+    pub file: std::path::PathBuf,
+    /// The room.
+    pub room: rhytid_shared::RoomName,
+    /// How.
+    pub request: PlayRequest,
 }
 
 /// Where a connection comes from.
@@ -85,6 +99,7 @@ pub(crate) struct Hub {
     pub layout: PacketLayout,
     pub rooms: Rooms,
     pub recorder: Recorder,
+    pub players: Players,
     pub trackers: Trackers,
     pub metrics: Arc<Metrics>,
     pub listens_on_loopback: bool,
@@ -174,6 +189,7 @@ pub async fn run(
     let hello_character = ViewHello::new("", &character, character_url.clone()).character;
     let layout = PacketLayout::from(&*character);
     let hub = Arc::new(Hub {
+        players: Players::default(),
         recorder: Recorder::new(config.record.clone(), hello_character.clone(), layout.clone(), metrics.clone()),
         hello_character,
         layout,
@@ -192,6 +208,9 @@ pub async fn run(
     });
     let app = router(hub.clone());
     tracing::info!(%address, character = hub.character.name, "serving");
+    if let Some(Play { file, room, request }) = hub.config.play.clone() {
+        hub.players.start(&hub, &room, &file, request).map_err(ServerError::Play)?;
+    }
     listen::start(&hub, ports);
     vmc_out::start(&hub, outs);
     tokio::pin!(shutdown);

@@ -109,10 +109,12 @@ impl Recording {
         let mut first = None;
         // Channels stand where they were first used; a finished file lists them at its end as well.
         let until = if cut_at.is_some() { chunks.len() } else { 1 };
-        for chunk in chunks.iter().take(until) {
-            let entries = recording.read(chunk)?;
-            if first.is_none() {
-                first = entries.into_iter().next();
+        for (index, chunk) in chunks.iter().take(until).enumerate() {
+            match recording.read(chunk) {
+                Ok(entries) if index == 0 => first = entries.into_iter().next(),
+                Err(error) if index == 0 => return Err(error),
+                // Those that are damaged say so when they are read.
+                _ => {}
             }
         }
         let Unchecked { file, path, length, channels } = recording;

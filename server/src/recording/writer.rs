@@ -7,7 +7,7 @@
 //! At least every [`FLUSH`] the thread closes its chunk and hands it to the system: a killed process loses what came since, a
 //! stopped machine what came since the last `fdatasync`, every [`SYNC`].
 
-use super::format::{PROFILE, SessionEvent, Topic, VERSION};
+use super::format::{Entry, PROFILE, SessionEvent, Topic, VERSION};
 use crate::metrics::Metrics;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
@@ -543,16 +543,24 @@ impl<W: Write> RecordingWriter<W> {
             Item::Text { slot, t, text } => self.message(&Topic::Text(slot.to_string()), at, t, text.as_bytes()),
             Item::Binary { slot, t, bytes } => self.message(&Topic::Binary(slot.to_string()), at, t, &bytes),
             Item::Refused { slot, bytes } => self.message(&Topic::Refused(slot.to_string()), at, None, &bytes),
-            Item::Packet(bytes) => {
-                let is_key = PacketKind::of(&bytes) == Some(PacketKind::Key);
-                let is_old = self.open_since.is_some_and(|since| since.elapsed() >= FLUSH_AT_KEY);
-                if (is_key && is_old) || self.packets.len() >= MAX_BATCH {
-                    self.flush()?;
-                }
-                self.packet(at, bytes);
-                Ok(())
-            }
+            Item::Packet(bytes) => self.put_packet(at, bytes),
         }
+    }
+
+    /// Keeps a packet for the next batch; a chunk that is old enough is closed before a key packet.
+    pub(super) fn put_packet(&mut self, at: u64, bytes: Bytes) -> Result<(), McapError> {
+        let is_key = PacketKind::of(&bytes) == Some(PacketKind::Key);
+        let is_old = self.open_since.is_some_and(|since| since.elapsed() >= FLUSH_AT_KEY);
+        if (is_key && is_old) || self.packets.len() >= MAX_BATCH {
+            self.flush()?;
+        }
+        self.packet(at, bytes);
+        Ok(())
+    }
+
+    /// Closes the chunk where it has been open long enough.
+    pub(super) fn flush_if_due(&mut self) -> Result<(), McapError> {
+        if self.due_in().is_zero() { self.flush() } else { Ok(()) }
     }
 
     /// Writes an event as of `at`, Unix clock, ns.
@@ -569,6 +577,15 @@ impl<W: Write> RecordingWriter<W> {
             self.last_t = (t * 1e9) as u64;
         }
         self.write(topic, at, self.last_t, data)
+    }
+
+    /// Writes a message of another recording as it stands there.
+    pub(super) fn copy(&mut self, entry: &Entry) -> Result<(), McapError> {
+        let at = self.tell(entry.log_time);
+        self.last_t = entry.publish_time;
+        // A batch is of the time of its first packet, which its messages have passed.
+        let at = if entry.topic == Topic::Packets { entry.log_time } else { at };
+        self.write(&entry.topic, at, entry.publish_time, &entry.data)
     }
 
     /// Keeps a packet for the next batch.

@@ -1,0 +1,428 @@
+//! Playing a recording into a room: its faces go to the room's viewers as they were, and whoever may ask can stop, seek and change the
+//! speed. Every jump begins a new session, because a session's time does not go back.
+
+use super::faces::{Faces, Moment};
+use super::reader::{ReadError, Recording};
+use crate::room::{Evicted, Publishing, RoomError};
+use crate::service::Hub;
+use rhytid_shared::RoomName;
+use rhytid_shared::packet::Encoder;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Players at a time: each is a thread and a few hundred KB.
+const MOST_PLAYERS: usize = 16;
+/// How often a face that stands still is sent again, so that viewers do not take its sender for gone.
+const HOLD: Duration = Duration::from_millis(50);
+/// How often a player that waits looks whether the service ends.
+const LOOK: Duration = Duration::from_millis(100);
+/// Speeds that make sense; an infinite one sends everything at once.
+const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=100.0;
+/// Frames sent in a row at infinite speed before commands are looked at.
+const BURST: usize = 256;
+
+/// What a player shall do; what is not said stays as it is.
+#[derive(Debug, Clone, PartialEq, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PlayRequest {
+    /// A recording in the server's folder, by its name. Starts a player, in place of one that plays another.
+    pub file: Option<String>,
+    /// Go there, seconds since the recording began.
+    pub position: Option<f64>,
+    /// Play, or stand still.
+    pub playing: Option<bool>,
+    /// Seconds of the recording a second, 0.01 to 100.
+    pub speed: Option<f64>,
+    /// Begin again at the end.
+    #[serde(rename = "loop")]
+    pub repeats: Option<bool>,
+    /// Where it begins, also again; seconds.
+    pub from: Option<f64>,
+    /// Where it ends, seconds.
+    pub to: Option<f64>,
+    /// Take the room from a publisher that is there.
+    pub takeover: bool,
+}
+
+/// How a player stands.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PlayStatus {
+    /// Name of the recording.
+    pub file: String,
+    /// Seconds since the recording began.
+    pub position: f64,
+    /// How long it is, seconds.
+    pub seconds: f64,
+    /// Whether it moves.
+    pub playing: bool,
+    /// Seconds of the recording a second.
+    pub speed: f64,
+    /// Begins again at the end.
+    #[serde(rename = "loop")]
+    pub repeats: bool,
+    /// Where it begins, seconds.
+    pub from: f64,
+    /// Where it ends, seconds.
+    pub to: f64,
+    /// Why it has ended, where it has.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
+}
+
+/// Why a player did not start or does not obey.
+#[derive(Debug, thiserror::Error)]
+pub enum PlayError {
+    /// The recording cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// It is of another character.
+    #[error("the recording is of character {recorded:?}, this server has {served:?}, which is another file")]
+    Character {
+        /// Its name in the recording.
+        recorded: String,
+        /// The server's.
+        served: String,
+    },
+    /// There is no player in the room.
+    #[error("nothing is played in this room; say which \"file\"")]
+    NoPlayer,
+    /// The server was started without a folder of recordings.
+    #[error("this server keeps no recordings; start it with --record DIR")]
+    NoFolder,
+    /// The name is none of a recording.
+    #[error("field file is {got:?}, expected the name of a recording in the server's folder")]
+    File {
+        /// The name.
+        got: String,
+    },
+    /// A number outside its range.
+    #[error("field {field} is {got}, expected {expected}")]
+    Range {
+        /// The field.
+        field: &'static str,
+        /// Its value.
+        got: f64,
+        /// The range.
+        expected: &'static str,
+    },
+    /// There are too many.
+    #[error("the server plays {MOST_PLAYERS} recordings already, which is its limit")]
+    TooMany,
+    /// The room cannot be had.
+    #[error("{0}")]
+    Room(String),
+}
+
+impl PlayRequest {
+    fn check(&self) -> Result<(), PlayError> {
+        for (field, value) in [("position", self.position), ("from", self.from), ("to", self.to)] {
+            if let Some(got) = value.filter(|value| !(0.0..=1e9).contains(value)) {
+                return Err(PlayError::Range { field, got, expected: "seconds, 0 or more" });
+            }
+        }
+        match self.speed.filter(|speed| !SPEEDS.contains(speed) && *speed != f64::INFINITY) {
+            Some(got) => Err(PlayError::Range { field: "speed", got, expected: "0.01 to 100" }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// All players, by room.
+#[derive(Default)]
+pub(crate) struct Players {
+    by_room: Mutex<BTreeMap<RoomName, Handle>>,
+}
+
+/// A player's outer end; dropped, it ends.
+struct Handle {
+    requests: Sender<PlayRequest>,
+    status: Arc<Mutex<PlayStatus>>,
+}
+
+/// What stands under these locks is whole at each step.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Players {
+    /// Does what `request` says in `room`. May read a file.
+    pub fn request(&self, hub: &Arc<Hub>, room: &RoomName, request: PlayRequest) -> Result<PlayStatus, PlayError> {
+        request.check()?;
+        if let Some(file) = &request.file {
+            let path = path_of(hub.recorder.dir(), file)?;
+            return self.start(hub, room, &path, request);
+        }
+        let by_room = lock(&self.by_room);
+        let handle = by_room.get(room).filter(|handle| lock(&handle.status).error.is_none()).ok_or(PlayError::NoPlayer)?;
+        handle.requests.send(request.clone()).map_err(|_| PlayError::NoPlayer)?;
+        let mut status = lock(&handle.status).clone();
+        // As it will be in a moment.
+        status.position = request.position.unwrap_or(status.position);
+        status.playing = request.playing.unwrap_or(status.playing);
+        status.speed = request.speed.unwrap_or(status.speed);
+        status.repeats = request.repeats.unwrap_or(status.repeats);
+        Ok(status)
+    }
+
+    /// Plays the recording at `path` in `room`.
+    pub fn start(&self, hub: &Arc<Hub>, room: &RoomName, path: &Path, request: PlayRequest) -> Result<PlayStatus, PlayError> {
+        request.check()?;
+        let recording = Recording::open(path)?;
+        if recording.character().sha256 != hub.character.sha256 {
+            let (recorded, served) = (recording.character().name.clone(), hub.character.name.clone());
+            return Err(PlayError::Character { recorded, served });
+        }
+        let mut by_room = lock(&self.by_room);
+        // One of our own in this room makes place; others that have ended are forgotten.
+        let replaces = by_room.remove(room).is_some_and(|handle| lock(&handle.status).error.is_none());
+        by_room.retain(|_, handle| lock(&handle.status).error.is_none());
+        if by_room.len() >= MOST_PLAYERS {
+            return Err(PlayError::TooMany);
+        }
+        let seconds = recording.seconds();
+        let from = request.from.unwrap_or(0.0).min(seconds);
+        let status = PlayStatus {
+            file: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            position: request.position.unwrap_or(from),
+            seconds,
+            playing: request.playing.unwrap_or(true),
+            speed: request.speed.unwrap_or(1.0),
+            repeats: request.repeats.unwrap_or(false),
+            from,
+            to: request.to.unwrap_or(seconds).clamp(from, seconds),
+            error: None,
+        };
+        let source = format!("replay of {}", status.file);
+        let place = Seat::take(hub, room, &source, request.takeover || replaces).map_err(|error| PlayError::Room(error.to_string()))?;
+        let (requests, inbox) = channel();
+        let shared = Arc::new(Mutex::new(status.clone()));
+        let handle = Handle { requests, status: shared.clone() };
+        let hub = hub.clone();
+        let run = move || {
+            let mut player = Player::new(&hub, Faces::new(recording), place, status);
+            let ended = player.run(&inbox, &shared);
+            let mut status = lock(&shared);
+            status.playing = false;
+            status.error = Some(ended.map_or_else(|error| error.to_string(), |why| why.to_owned()));
+            drop(status);
+            drop(player);
+        };
+        let thread = std::thread::Builder::new().name("player".into()).spawn(run);
+        thread.map_err(|error| PlayError::Room(format!("cannot start a thread: {error}")))?;
+        let told = lock(&handle.status).clone();
+        by_room.insert(room.clone(), handle);
+        Ok(told)
+    }
+
+    /// How the player of `room` stands.
+    pub fn status(&self, room: &RoomName) -> Option<PlayStatus> {
+        lock(&self.by_room).get(room).map(|handle| lock(&handle.status).clone())
+    }
+
+    /// Ends the player of `room`.
+    pub fn stop(&self, room: &RoomName) -> Option<PlayStatus> {
+        lock(&self.by_room).remove(room).map(|handle| lock(&handle.status).clone())
+    }
+}
+
+/// The recording called `name` in `dir`: a plain name, so that nothing outside can be meant.
+fn path_of(dir: Option<&Path>, name: &str) -> Result<PathBuf, PlayError> {
+    let dir = dir.ok_or(PlayError::NoFolder)?;
+    let is_plain = name.len() <= 255
+        && name.ends_with(".mcap")
+        && !name.starts_with('.')
+        && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'_'));
+    let path = dir.join(name);
+    if is_plain && path.is_file() { Ok(path) } else { Err(PlayError::File { got: name.chars().take(80).collect() }) }
+}
+
+/// The player's place in its room, for one session.
+struct Seat {
+    place: Publishing,
+    evicted: Evicted,
+}
+
+impl Seat {
+    fn take(hub: &Hub, room: &RoomName, source: &str, takeover: bool) -> Result<Self, RoomError> {
+        let (place, evicted) = hub.rooms.claim(room, source, takeover)?;
+        Ok(Self { place, evicted })
+    }
+}
+
+struct Player<'a> {
+    hub: &'a Hub,
+    room: RoomName,
+    source: String,
+    faces: Faces,
+    seat: Seat,
+    encoder: Encoder,
+    packet: Vec<u8>,
+    num_frames: u32,
+    status: PlayStatus,
+    /// The next face's time; it stands in the reader.
+    next: Option<Moment>,
+    /// The face that is shown.
+    shown: rhytid_shared::FaceFrame,
+    /// A place in the recording, seconds, and when it was there.
+    anchor: (f64, Instant),
+    /// When the session began, and its last time, µs.
+    begun: Instant,
+    last_micros: Option<u64>,
+}
+
+impl<'a> Player<'a> {
+    fn new(hub: &'a Hub, faces: Faces, seat: Seat, status: PlayStatus) -> Self {
+        let now = Instant::now();
+        Self {
+            hub,
+            room: seat.place.room.name.clone(),
+            source: format!("replay of {}", status.file),
+            shown: faces.frame().clone(),
+            faces,
+            seat,
+            encoder: Encoder::new(hub.layout.clone()),
+            packet: Vec::new(),
+            num_frames: 0,
+            next: None,
+            anchor: (status.position, now),
+            status,
+            begun: now,
+            last_micros: None,
+        }
+    }
+
+    /// Plays until it is told to end, another publisher takes the room, or the service ends; says which.
+    fn run(&mut self, inbox: &Receiver<PlayRequest>, shared: &Mutex<PlayStatus>) -> Result<&'static str, ReadError> {
+        self.go_to(self.status.position)?;
+        loop {
+            let mut due = self.due();
+            if self.status.speed.is_infinite() && self.status.playing {
+                due = Some(Instant::now());
+            }
+            let wait =
+                due.map_or(HOLD, |due| due.saturating_duration_since(Instant::now())).min(if self.status.playing { LOOK } else { HOLD });
+            match inbox.recv_timeout(wait) {
+                Ok(request) => self.obey(&request)?,
+                Err(RecvTimeoutError::Disconnected) => return Ok("ended"),
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+            if *self.hub.shutdown.borrow() {
+                return Ok("the server is shutting down");
+            }
+            if self.seat.evicted.try_recv().is_ok() {
+                return Ok("another publisher has taken the room over");
+            }
+            if self.status.playing {
+                self.play()?;
+            } else {
+                self.send();
+            }
+            *lock(shared) = self.status.clone();
+        }
+    }
+
+    /// When the next face is due.
+    fn due(&self) -> Option<Instant> {
+        let next = self.next.filter(|_| self.status.playing)?;
+        let ahead = (next.smooth - self.anchor.0).max(0.0) / self.status.speed;
+        Some(self.anchor.1 + Duration::from_secs_f64(ahead.min(1e6)))
+    }
+
+    /// Sends the faces that are due.
+    fn play(&mut self) -> Result<(), ReadError> {
+        for _ in 0..BURST {
+            let now = Instant::now();
+            self.status.position = if self.status.speed.is_finite() {
+                self.anchor.0 + (now - self.anchor.1).as_secs_f64() * self.status.speed
+            } else {
+                self.next.map_or(self.status.position, |next| next.smooth)
+            };
+            let is_over = self.next.is_none_or(|next| next.smooth > self.status.to) && {
+                // What follows the last face belongs to the recording, too.
+                self.status.speed.is_infinite() || self.status.position >= self.status.to || self.next.is_none()
+            };
+            if is_over {
+                if self.status.repeats && self.status.to > self.status.from {
+                    self.renew();
+                    return self.go_to(self.status.from);
+                }
+                (self.status.playing, self.status.position) = (false, self.status.to);
+                return Ok(());
+            }
+            let is_due = self.status.speed.is_infinite() || self.due().is_some_and(|due| due <= now);
+            let Some(next) = self.next.filter(|_| is_due) else { return Ok(()) };
+            self.shown.clone_from(self.faces.frame());
+            self.send();
+            self.status.position = self.status.position.max(next.smooth);
+            self.next = self.faces.advance()?;
+        }
+        Ok(())
+    }
+
+    fn obey(&mut self, request: &PlayRequest) -> Result<(), ReadError> {
+        let now = Instant::now();
+        // From here on by the new speed.
+        self.anchor = (self.status.position, now);
+        let seconds = self.status.seconds;
+        self.status.from = request.from.map_or(self.status.from, |from| from.min(seconds));
+        self.status.to = request.to.unwrap_or(self.status.to).clamp(self.status.from, seconds);
+        self.status.speed = request.speed.unwrap_or(self.status.speed);
+        self.status.repeats = request.repeats.unwrap_or(self.status.repeats);
+        let starts = request.playing == Some(true) && !self.status.playing;
+        self.status.playing = request.playing.unwrap_or(self.status.playing);
+        let is_at_end = starts && request.position.is_none() && self.status.position >= self.status.to;
+        if let Some(position) = request.position.or(is_at_end.then_some(self.status.from)) {
+            self.renew();
+            self.go_to(position.min(seconds))?;
+        }
+        Ok(())
+    }
+
+    /// Begins a session anew, unless another publisher has the room.
+    fn renew(&mut self) {
+        if self.seat.evicted.try_recv().is_ok() {
+            // Found again by the loop: nobody evicts a place twice, so it is told to end itself.
+            self.hub.players.stop(&self.room);
+            return;
+        }
+        if let Ok(seat) = Seat::take(self.hub, &self.room, &self.source, true) {
+            self.seat = seat;
+            self.encoder = Encoder::new(self.hub.layout.clone());
+            self.num_frames = 0;
+            (self.begun, self.last_micros) = (Instant::now(), None);
+        }
+    }
+
+    /// Shows the face at `position`, seconds, and goes on from there.
+    fn go_to(&mut self, position: f64) -> Result<(), ReadError> {
+        if self.faces.seek(position)?.is_some() {
+            self.shown.clone_from(self.faces.frame());
+            self.send();
+            self.next = self.faces.advance()?;
+        } else {
+            self.next = None;
+        }
+        self.status.position = position;
+        self.anchor = (position, Instant::now());
+        Ok(())
+    }
+
+    /// Sends the face that is shown, as of now.
+    fn send(&mut self) {
+        let now = self.begun.elapsed().as_micros() as u64;
+        // Two faces of one time would be one.
+        let micros = self.last_micros.map_or(now, |last| now.max(last + 1));
+        self.last_micros = Some(micros);
+        self.shown.session = self.seat.place.session;
+        self.shown.seq = self.num_frames;
+        self.shown.captured_at_micros = micros;
+        self.num_frames = self.num_frames.wrapping_add(1);
+        let kind = self.encoder.encode(&self.shown, &mut self.packet);
+        // An eviction is noticed by the loop.
+        self.seat.place.publish(kind, &self.packet, &self.shown);
+    }
+}

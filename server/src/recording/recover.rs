@@ -1,0 +1,117 @@
+//! Mending a recording that was not finished, or was damaged: what is whole is written anew, with its index.
+
+use super::format::{SessionEvent, Topic};
+use super::reader::{ReadError, Recording};
+use super::writer::RecordingWriter;
+use mcap::McapError;
+use rhytid_shared::packet::BatchReader;
+use std::fs::{File, OpenOptions};
+use std::path::{Path, PathBuf};
+
+/// Why a recording could not be mended.
+#[derive(Debug, thiserror::Error)]
+pub enum RecoverError {
+    /// Nothing in it can be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// The mended file could not be written.
+    #[error("cannot write {path}: {problem}")]
+    Write {
+        /// The file.
+        path: String,
+        /// What happened.
+        problem: String,
+    },
+}
+
+/// What was kept and what was lost.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct RecoverReport {
+    /// True where the file was whole, so that nothing was written.
+    pub was_whole: bool,
+    /// Messages kept.
+    pub messages: u64,
+    /// Packets kept.
+    pub packets: u64,
+    /// Seconds from the first message kept to the last.
+    pub seconds: f64,
+    /// Bytes at the end that make no whole chunk.
+    pub cut_off: u64,
+    /// Chunks in the middle that are damaged, with what is wrong with each, at most ten of them.
+    pub damaged: Vec<String>,
+    /// How many there are.
+    pub num_damaged: u64,
+    /// Batches of packets that go on from what was lost.
+    pub orphans: u64,
+}
+
+/// Mends the recording at `path`, in its place, or into `out` (which must not exist). Without damage nothing is written.
+pub fn recover(path: &Path, out: Option<&Path>) -> Result<RecoverReport, RecoverError> {
+    let mut recording = Recording::open(path)?;
+    let target = out.map_or_else(|| temporary(path), Path::to_owned);
+    let mut report = RecoverReport { cut_off: recording.cut_off().unwrap_or(0), ..RecoverReport::default() };
+    // Looked through first: a file that is whole is left alone.
+    let is_finished = recording.cut_off().is_none();
+    if is_finished && (0..recording.chunks().len()).all(|index| recording.read_chunk(index).is_ok()) {
+        report.was_whole = true;
+        report.seconds = recording.seconds();
+        return Ok(report);
+    }
+    let broken = |problem: String| RecoverError::Write { path: target.display().to_string(), problem };
+    let file = OpenOptions::new().write(true).create_new(true).open(&target).map_err(|error| broken(error.to_string()))?;
+    let written = copy(&mut recording, file, &mut report);
+    let finished = written.and_then(|()| if out.is_none() { std::fs::rename(&target, path).map_err(McapError::Io) } else { Ok(()) });
+    if let Err(error) = finished {
+        let _ = std::fs::remove_file(&target);
+        return Err(broken(error.to_string()));
+    }
+    Ok(report)
+}
+
+fn temporary(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".mended");
+    name.into()
+}
+
+fn copy(recording: &mut Recording, file: File, report: &mut RecoverReport) -> Result<(), McapError> {
+    let layout = recording.layout().clone();
+    let handle = file.try_clone()?;
+    let mut writer = RecordingWriter::to(file, layout.clone()).map_err(|error| McapError::Io(std::io::Error::other(error)))?;
+    let mut batches = BatchReader::new(layout);
+    let (mut first, mut last) = (None, 0);
+    for index in 0..recording.chunks().len() {
+        let entries = match recording.read_chunk(index) {
+            Ok(entries) => entries,
+            Err(error) => {
+                report.num_damaged += 1;
+                if report.damaged.len() < 10 {
+                    report.damaged.push(error.to_string());
+                }
+                // How many messages it had, nobody knows.
+                writer.event(last, &SessionEvent::Gap { messages: 0 })?;
+                continue;
+            }
+        };
+        for entry in entries {
+            if entry.topic == Topic::Packets {
+                let mut num = 0;
+                if batches.unpack(&entry.data, |_, _| num += 1).is_err() {
+                    report.orphans += 1;
+                    continue;
+                }
+                report.packets += num;
+            }
+            report.messages += 1;
+            first.get_or_insert(entry.log_time);
+            last = last.max(entry.log_time);
+            writer.copy(&entry)?;
+        }
+        writer.flush()?;
+    }
+    report.seconds = last.saturating_sub(first.unwrap_or(last)) as f64 / 1e9;
+    writer.event(last, &SessionEvent::Stop { reason: "cut; mended afterwards".into() })?;
+    writer.finish()?;
+    handle.sync_all()?;
+    Ok(())
+}
