@@ -11,6 +11,7 @@ use crate::asset::{AssetError, CharacterAsset};
 use crate::picture_size::parse_size;
 use crate::renderer::{Camera, DrawSettings, Headless, RenderError, RenderFrame, ViewMode};
 use crate::spectator::{Spectator, Status, StatusKind, WatchArgs};
+use crate::video::{Video, VideoError};
 use animation::{Animation, Palette};
 use glam::Quat;
 use image::RgbaImage;
@@ -39,6 +40,9 @@ pub struct FilmArgs {
     /// Most pictures a second
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..=50))]
     pub fps: u32,
+    /// Write face.mp4 as well, through ffmpeg
+    #[arg(long)]
+    pub mp4: bool,
 }
 
 /// What was filmed.
@@ -71,6 +75,9 @@ pub enum FilmError {
         /// What the system or the encoder said.
         problem: String,
     },
+    /// The video cannot be written.
+    #[error(transparent)]
+    Video(#[from] VideoError),
     /// No live face came.
     #[error("nothing to film, no live face came: {status}")]
     NeverLive {
@@ -127,6 +134,10 @@ pub fn run(args: &FilmArgs, is_stopped: &AtomicBool) -> Result<Film, FilmError> 
 
     let path = args.out.join("face.gif");
     let mut animation = Animation::create(&path, args.size, palette).map_err(|error| write_error(&path, &error))?;
+    let mut video = match args.mp4 {
+        true => Some(Video::create(&args.out.join("face.mp4"), args.size, f64::from(args.fps))?),
+        false => None,
+    };
     let mut moments: Vec<Moment> = Vec::new();
     let beginning = Instant::now();
     let interval = Duration::from_secs(1) / args.fps;
@@ -143,6 +154,9 @@ pub fn run(args: &FilmArgs, is_stopped: &AtomicBool) -> Result<Film, FilmError> 
             break;
         }
         let picture = crew.draw(&frame, ViewMode::Beauty, args.size)?;
+        if let Some(video) = &mut video {
+            video.add(&picture, now - beginning)?;
+        }
         animation.add(picture, now - beginning).map_err(|error| write_error(&path, &error))?;
         moments.push(Moment { at: now - beginning, frame });
         // Missed beats are left out, not caught up with.
@@ -152,6 +166,9 @@ pub fn run(args: &FilmArgs, is_stopped: &AtomicBool) -> Result<Film, FilmError> 
         }
     }
     let length = moments.last().map_or(Duration::ZERO, |moment| moment.at);
+    if let Some(video) = video {
+        video.finish(beginning.elapsed())?;
+    }
     animation.finish(beginning.elapsed()).map_err(|error| write_error(&path, &error))?;
 
     let contact_sheet = args.out.join("contact-sheet.png");

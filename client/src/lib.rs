@@ -14,6 +14,7 @@ pub mod renderer;
 mod sheet;
 pub mod spectator;
 pub mod twin;
+mod video;
 pub mod view;
 
 pub use asset::{AssetError, CharacterAsset};
@@ -21,3 +22,4 @@ pub use link::{Link, LinkOptions, LinkState, LinkStats, ServerAddress};
 pub use playout::{Playout, PlayoutState, PlayoutStats};
 pub use renderer::{BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, Renderer, ViewMode};
 pub use spectator::{Spectator, Status, StatusKind};
+pub use video::{Video, VideoError};

@@ -72,7 +72,9 @@ fn run(cli: Cli) -> anyhow::Result<()> {
         #[cfg(feature = "embedded")]
         Command::Render(args) => {
             let num_pictures = render_cli::render(&args)?;
-            println!("{num_pictures} pictures in {}", args.out.display());
+            for place in [&args.out, &args.mp4].into_iter().flatten() {
+                println!("{num_pictures} pictures in {}", place.display());
+            }
         }
         #[cfg(feature = "embedded")]
         Command::Still(args) => render_cli::still(&args)?,

@@ -5,16 +5,19 @@ use crate::picture_size::parse_size;
 use crate::renderer::{
     BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode, WrinkleSystem, ZoneBlend,
 };
+use crate::video::{Video, VideoError};
 use glam::{Quat, Vec3};
 use image::RgbaImage;
 use indicatif::{ProgressBar, ProgressStyle};
 use rhytid_server::feed::{Feed, FeedError, FeedItem};
+use rhytid_server::recording::{Faces, ReadError, Recording};
 use rhytid_server::solve::{SolveConfig, SolveError, Solver};
 use rhytid_shared::{
     ArkitShape, Character, DEFAULT_CHARACTER_GLB, FaceFrame, HeadPose, NUM_ARKIT_SHAPES, PublishHello, TrackingData, TrackingFrame,
 };
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Why there is no picture.
 #[derive(Debug, thiserror::Error)]
@@ -56,6 +59,22 @@ pub enum PictureError {
         /// What the solve said.
         source: SolveError,
     },
+    /// The recording.
+    #[error(transparent)]
+    Recording(#[from] ReadError),
+    /// The recording moves another character.
+    #[error("{path} is of character {recorded:?}, this is another file ({given:?}); give its own with --character")]
+    OtherCharacter {
+        /// The recording.
+        path: String,
+        /// Its character.
+        recorded: String,
+        /// The one given.
+        given: String,
+    },
+    /// The video.
+    #[error(transparent)]
+    Video(#[from] VideoError),
     /// A file holds no neutral face.
     #[error("{path} holds no neutral face: {source}")]
     Calibration {
@@ -150,12 +169,18 @@ pub struct PictureArgs {
 /// Arguments of `render`.
 #[derive(Debug, Clone, clap::Args)]
 pub struct RenderArgs {
-    /// Feed file
-    #[arg(value_name = "FEED.jsonl")]
+    /// Feed file (.jsonl, or a Live Link Face recording .csv), or a recording (.mcap), whose packets are drawn as they went out
+    #[arg(value_name = "FEED")]
     pub feed: PathBuf,
     /// Folder for the pictures, named by the index of their frame: 00000.png, …
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "mp4")]
+    pub out: Option<PathBuf>,
+    /// Write a video, through ffmpeg
+    #[arg(long, value_name = "FILE.mp4")]
+    pub mp4: Option<PathBuf>,
+    /// Pictures a second in the video
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
     /// Draw every n-th frame; all are solved
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub every: u32,
@@ -241,18 +266,78 @@ impl PictureMaker {
         Ok(Self { asset, headless, settings, size: args.size, supersample: args.supersample })
     }
 
-    fn draw(&mut self, frame: &FaceFrame, path: &Path) -> Result<()> {
+    fn picture(&mut self, frame: &FaceFrame) -> Result<RgbaImage> {
         let large = self.size.map(|side| side * self.supersample);
         let picture = self.headless.render(large, &self.settings, &RenderFrame::from(frame))?;
-        let picture = if self.supersample > 1 { averaged(&picture, self.supersample) } else { picture };
+        Ok(if self.supersample > 1 { averaged(&picture, self.supersample) } else { picture })
+    }
+
+    fn draw(&mut self, frame: &FaceFrame, path: &Path) -> Result<()> {
+        let picture = self.picture(frame)?;
         picture.save(path).map_err(|source| PictureError::Write { path: path.display().to_string(), source })
     }
 }
 
-/// Solves a whole feed and draws its frames; returns how many pictures were written.
+/// Where the pictures of a feed go.
+struct Output<'a> {
+    args: &'a RenderArgs,
+    maker: PictureMaker,
+    video: Option<Video>,
+    /// Time of the first frame and of the newest, seconds.
+    times: Option<(f64, f64)>,
+    /// Frames so far, and pictures.
+    index: usize,
+    num_written: usize,
+}
+
+impl<'a> Output<'a> {
+    fn open(args: &'a RenderArgs) -> Result<Self> {
+        let maker = PictureMaker::open(&args.picture)?;
+        if let Some(out) = &args.out {
+            std::fs::create_dir_all(out).map_err(|source| PictureError::Io { path: out.display().to_string(), source })?;
+        }
+        let video = args.mp4.as_ref().map(|path| Video::create(path, args.picture.size, args.fps)).transpose()?;
+        Ok(Self { args, maker, video, times: None, index: 0, num_written: 0 })
+    }
+
+    /// Draws the frame of time `t`, seconds, where its turn has come; false where there are enough pictures.
+    fn take(&mut self, t: f64, frame: &FaceFrame) -> Result<bool> {
+        let index = self.index;
+        self.index += 1;
+        let (first, _) = *self.times.get_or_insert((t, t));
+        self.times = Some((first, t));
+        if !index.is_multiple_of(self.args.every as usize) {
+            return Ok(true);
+        }
+        let picture = self.maker.picture(frame)?;
+        if let Some(video) = &mut self.video {
+            video.add(&picture, Duration::from_secs_f64((t - first).max(0.0)))?;
+        }
+        if let Some(out) = &self.args.out {
+            let path = out.join(format!("{index:05}.png"));
+            picture.save(&path).map_err(|source| PictureError::Write { path: path.display().to_string(), source })?;
+        }
+        self.num_written += 1;
+        Ok(self.args.limit.is_none_or(|limit| self.num_written < limit))
+    }
+
+    /// Ends the video; gives the number of pictures.
+    fn finish(self) -> Result<usize> {
+        if let Some(video) = self.video {
+            let (first, last) = self.times.unwrap_or_default();
+            video.finish(Duration::from_secs_f64(last - first + 1.0 / self.args.fps))?;
+        }
+        Ok(self.num_written)
+    }
+}
+
+/// Draws the frames of a feed, which are solved, or of a recording; returns how many pictures were written.
 pub fn render(args: &RenderArgs) -> Result<usize> {
-    let mut maker = PictureMaker::open(&args.picture)?;
-    let character = Arc::clone(&maker.asset.character);
+    if args.feed.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("mcap")) {
+        return render_recording(args);
+    }
+    let mut output = Output::open(args)?;
+    let character = Arc::clone(&output.maker.asset.character);
     let path = args.feed.display().to_string();
     let num_frames = count_frames(&args.feed)?;
     let mut feed = Feed::open(&args.feed, &character)?;
@@ -260,12 +345,10 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
         Some(path) => start_calibrated(&character, &feed.hello, path)?,
         None => Solver::new(Arc::clone(&character), &SolveConfig::default(), &feed.hello)?,
     };
-    std::fs::create_dir_all(&args.out).map_err(|source| PictureError::Io { path: args.out.display().to_string(), source })?;
 
     let progress = progress_bar(num_frames);
     let mut tracked = TrackingFrame::default();
     let mut solved = FaceFrame::at_rest(&character);
-    let (mut index, mut num_written) = (0_usize, 0);
     while let Some(item) = feed.next_frame(&mut tracked)? {
         match item {
             FeedItem::Calibrate => solver.calibrate(),
@@ -275,13 +358,8 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
                     line: feed.line(),
                     source,
                 })?;
-                if index.is_multiple_of(args.every as usize) {
-                    maker.draw(&solved, &args.out.join(format!("{index:05}.png")))?;
-                    num_written += 1;
-                }
-                index += 1;
                 progress.inc(1);
-                if args.limit.is_some_and(|limit| num_written >= limit) {
+                if !output.take(tracked.t, &solved)? {
                     break;
                 }
             }
@@ -291,7 +369,31 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
     if let Some(path) = &args.save_calibration {
         save_calibration(&solver, &args.feed, path)?;
     }
-    Ok(num_written)
+    output.finish()
+}
+
+/// Draws the packets of a recording as they went out.
+fn render_recording(args: &RenderArgs) -> Result<usize> {
+    if args.calibration.is_some() || args.save_calibration.is_some() {
+        return Err(PictureError::Lacks("neutral face to choose: a recording's packets are drawn as they are"));
+    }
+    let mut faces = Faces::new(Recording::open(&args.feed)?);
+    let mut output = Output::open(args)?;
+    let (recorded, given) = (faces.recording().character(), &output.maker.asset.character);
+    if recorded.sha256 != given.sha256 {
+        let (path, recorded, given) = (args.feed.display().to_string(), recorded.name.clone(), given.name.clone());
+        return Err(PictureError::OtherCharacter { path, recorded, given });
+    }
+    let seconds = faces.recording().seconds();
+    let progress = progress_bar((seconds * 1000.0) as u64);
+    while let Some(moment) = faces.advance()? {
+        progress.set_position((moment.at * 1000.0) as u64);
+        if !output.take(moment.smooth, faces.frame())? {
+            break;
+        }
+    }
+    progress.finish_and_clear();
+    output.finish()
 }
 
 /// A solver that starts from the neutral face in the file at `path`.
@@ -409,6 +511,13 @@ fn parse_weights(given: &[String]) -> Result<[f32; NUM_ARKIT_SHAPES]> {
         weights[shape.index()] = value;
     }
     Ok(weights)
+}
+
+fn parse_fps(text: &str) -> std::result::Result<f64, String> {
+    text.parse()
+        .ok()
+        .filter(|fps| (1.0..=240.0).contains(fps))
+        .ok_or_else(|| format!("{text:?} is no rate, expected 1 to 240 pictures a second"))
 }
 
 fn parse_zoom(text: &str) -> std::result::Result<f32, String> {

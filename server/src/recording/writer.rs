@@ -383,10 +383,10 @@ fn write_all(
 ) -> Result<(), EndedEarly> {
     let mut last_sync = Instant::now();
     let mut counted = 0;
-    let mut count = |bytes: u64| {
-        metrics.recording_bytes.inc_by(bytes - counted);
-        counted = bytes;
+    let count = |before: u64, bytes: u64| {
+        metrics.recording_bytes.inc_by(bytes - before);
         shared.bytes.store(bytes, Ordering::Relaxed);
+        bytes
     };
     loop {
         match items.recv_timeout(writer.due_in()) {
@@ -401,23 +401,25 @@ fn write_all(
             }
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => {
-                count(writer.finish()?);
+                count(counted, writer.finish()?);
                 return Ok(());
             }
         }
-        if writer.due_in().is_zero() {
-            writer.flush()?;
-            count(writer.num_bytes());
-            if last_sync.elapsed() >= SYNC {
-                writer.sync()?;
-                last_sync = Instant::now();
-            }
-            if writer.num_bytes() >= writer.most_bytes {
-                let error = EndedEarly::Full { bytes: writer.num_bytes(), most: writer.most_bytes };
-                writer.event(writer.last_time, &SessionEvent::Stop { reason: error.to_string() })?;
-                count(writer.finish()?);
-                return Err(error);
-            }
+        writer.flush_if_due()?;
+        // A key packet closes chunks, too.
+        if writer.num_bytes() == counted {
+            continue;
+        }
+        counted = count(counted, writer.num_bytes());
+        if last_sync.elapsed() >= SYNC {
+            writer.sync()?;
+            last_sync = Instant::now();
+        }
+        if writer.num_bytes() >= writer.most_bytes {
+            let error = EndedEarly::Full { bytes: writer.num_bytes(), most: writer.most_bytes };
+            writer.event(writer.last_time, &SessionEvent::Stop { reason: error.to_string() })?;
+            count(counted, writer.finish()?);
+            return Err(error);
         }
     }
 }
@@ -663,6 +665,76 @@ fn schema_name(topic: &Topic) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_does_not_fit_into_the_queue_is_counted_and_not_waited_for() {
+        let (queue, items) = sync_channel(2);
+        let metrics = Arc::new(Metrics::new());
+        let sink = Sink { started: Clock::now(), queue, shared: Arc::default(), metrics: metrics.clone() };
+        let slot: Arc<str> = "main".into();
+        let text = |len: usize| Item::Text { slot: slot.clone(), t: None, text: "x".repeat(len).into() };
+        let start = Instant::now();
+        for _ in 0..5 {
+            sink.put(text(10));
+        }
+        assert_eq!((sink.status().dropped, metrics.recording_dropped.get()), (3, 3));
+        assert_eq!(sink.shared.waiting_bytes.load(Ordering::Relaxed), 20);
+        // One that has room by number and not by bytes.
+        items.recv().unwrap();
+        sink.put(text(QUEUE_BYTES));
+        assert_eq!(sink.status().dropped, 4);
+        // After the end nothing is counted any more: that it has failed is.
+        drop(items);
+        sink.put(text(10));
+        assert_eq!(sink.status().dropped, 4);
+        assert!(start.elapsed() < Duration::from_secs(1));
+    }
+
+    #[test]
+    fn a_gap_a_full_file_and_the_end_are_written_down() {
+        let dir = std::env::temp_dir().join(format!("rhytid-writer-{}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        let (character, _) = crate::load_character(None).unwrap();
+        let hello = rhytid_shared::view::ViewHello::new("a", &character, String::new()).character;
+        let metrics = Arc::new(Metrics::new());
+        let config = RecordConfig { dir: Some(dir.clone()), file_bytes: 20_000, recordings: 1, ..RecordConfig::default() };
+        let recorder = Recorder::new(config, hello, PacketLayout::from(&*character), metrics.clone());
+        let (keeps, _kept) = mpsc::channel(1);
+        let room = RoomName::new("a").unwrap();
+        let (sink, made) = recorder.start(&room, keeps.clone()).unwrap();
+        made.recv().unwrap().unwrap();
+        let Err(RecordError::TooMany { most: 1 }) = recorder.start(&room, keeps) else { panic!("one is the limit") };
+        sink.shared.gap.store(7, Ordering::Relaxed);
+        let mut seed = 1u64;
+        let start = Instant::now();
+        while !sink.has_ended() {
+            // What does not compress.
+            let noise: String = std::iter::repeat_with(|| {
+                seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                char::from(b' ' + ((seed >> 33) % 90) as u8)
+            })
+            .take(2000)
+            .collect();
+            sink.put(Item::Text { slot: "main".into(), t: Some(1.0), text: noise.into() });
+            std::thread::sleep(Duration::from_millis(20));
+            assert!(start.elapsed() < Duration::from_secs(20), "it ends when the file is full");
+        }
+        let status = sink.status();
+        assert!(status.error.as_ref().is_some_and(|error| error.ends_with("its limit is 20000")), "{status:?}");
+        assert_eq!((metrics.recording_failures.get(), metrics.recordings.get()), (1, 0));
+        let path = dir.join(&status.file);
+        assert_eq!(metrics.recording_bytes.get(), std::fs::metadata(&path).unwrap().len());
+        let mut recording = super::super::Recording::open(&path).unwrap();
+        assert_eq!(recording.cut_off(), None, "it is finished all the same");
+        let mut text = String::new();
+        for index in 0..recording.chunks().len() {
+            for entry in recording.read_chunk(index).unwrap().iter().filter(|entry| entry.topic == Topic::Session) {
+                text.push_str(std::str::from_utf8(&entry.data).unwrap());
+            }
+        }
+        assert!(text.contains(r#"{"event":"gap","messages":7}"#) && text.contains(r#"{"event":"stop","reason":"the file has"#), "{text}");
+        std::fs::remove_dir_all(&dir).unwrap();
+    }
 
     #[test]
     fn stamps_are_dates() {

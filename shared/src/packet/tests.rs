@@ -243,3 +243,118 @@ proptest::proptest! {
         let _ = Decoder::new(&character).decode(&bytes, &mut frame);
     }
 }
+
+/// Packets of a moving face with arrivals that jitter, as a server has them.
+fn packets(character: &Character, num: u32) -> Vec<(u64, Vec<u8>)> {
+    let mut encoder = Encoder::new(character);
+    let mut frame_packets = Vec::new();
+    for seq in 0..num {
+        let mut packet = Vec::new();
+        let mut frame = moving_frame(character, seq);
+        if seq % 40 == 20 {
+            frame.face = false;
+        }
+        frame.shapes = (seq % 3 != 0).then(|| [(seq % 10) as f32 / 10.0; crate::NUM_ARKIT_SHAPES]);
+        encoder.encode(&frame, &mut packet);
+        frame_packets.push((1_700_000_000_000_000 + u64::from(seq) * 40_000 + u64::from(seq * 7919 % 3000), packet));
+    }
+    frame_packets
+}
+
+fn pack(writer: &mut BatchWriter, packets: &[(u64, Vec<u8>)]) -> Vec<u8> {
+    let mut batch = Vec::new();
+    writer.pack(packets.iter().map(|(at, packet)| (*at, packet.as_slice())), &mut batch).unwrap();
+    batch
+}
+
+fn unpack(reader: &mut BatchReader, batch: &[u8]) -> Result<Vec<(u64, Vec<u8>)>, BatchError> {
+    let mut packets = Vec::new();
+    reader.unpack(batch, |at, packet| packets.push((at, packet.to_vec()))).map(|()| packets)
+}
+
+#[test]
+fn batches_give_back_every_packet_to_the_byte_in_half_the_bytes() {
+    let character = tiny_character();
+    let packets = packets(&character, 200);
+    let (mut writer, mut reader) = (BatchWriter::new(&character), BatchReader::new(&character));
+    let mut num_bytes = 0;
+    for part in packets.chunks(23) {
+        let batch = pack(&mut writer, part);
+        num_bytes += batch.len();
+        assert_eq!(unpack(&mut reader, &batch).unwrap(), part);
+    }
+    let num_sent: usize = packets.iter().map(|(_, packet)| packet.len()).sum();
+    assert!(num_bytes * 10 < num_sent * 8, "{num_bytes} of {num_sent}");
+}
+
+#[test]
+fn packets_that_are_none_are_kept_as_they_are() {
+    let character = tiny_character();
+    let all = packets(&character, 60);
+    // Without the first key packet, with a gap, doubled, out of order, and with what is no packet at all.
+    let mut odd: Vec<(u64, Vec<u8>)> = all[1..].to_vec();
+    odd.drain(10..14);
+    odd.insert(5, odd[4].clone());
+    odd.swap(20, 21);
+    odd.insert(30, (3, Vec::new()));
+    odd.insert(31, (u64::MAX, vec![0xFF; 70]));
+    odd.insert(32, (0, vec![0x10, 1, 2, 3]));
+    let (mut writer, mut reader) = (BatchWriter::new(&character), BatchReader::new(&character));
+    for part in odd.chunks(9) {
+        assert_eq!(unpack(&mut reader, &pack(&mut writer, part)).unwrap(), part);
+    }
+    let too_long = [(0, vec![0; 70_000])];
+    let packets = too_long.iter().map(|(at, packet): &(u64, Vec<u8>)| (*at, packet.as_slice()));
+    assert_eq!(writer.pack(packets, &mut Vec::new()), Err(BatchError::TooLarge));
+}
+
+#[test]
+fn batches_can_be_entered_where_one_starts_anew_and_nowhere_else() {
+    let character = tiny_character();
+    let packets = packets(&character, 200);
+    let mut writer = BatchWriter::new(&character);
+    let is_key = |packet: &[u8]| PacketKind::of(packet) == Some(PacketKind::Key);
+    let (mut rest, mut batches) = (&packets[..], Vec::new());
+    while !rest.is_empty() {
+        // At key packets, and once between them.
+        let num = 1 + rest[1..].iter().take_while(|(_, packet)| !is_key(packet)).count().min(30);
+        batches.push((pack(&mut writer, &rest[..num]), &rest[..num]));
+        rest = &rest[num..];
+    }
+    assert!(batches.iter().filter(|(batch, _)| BatchReader::starts_anew(batch)).count() > 3);
+    assert!(batches.iter().any(|(batch, _)| !BatchReader::starts_anew(batch)));
+    for from in 0..batches.len() {
+        let mut reader = BatchReader::new(&character);
+        let mut can_read = false;
+        for (batch, packets) in &batches[from..] {
+            can_read |= BatchReader::starts_anew(batch);
+            match unpack(&mut reader, batch) {
+                Ok(read) => assert!(can_read && read == *packets),
+                Err(error) => assert!(!can_read && matches!(error, BatchError::Gap { .. }), "{error}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn no_bytes_break_the_reader_of_batches() {
+    let character = tiny_character();
+    let batch = pack(&mut BatchWriter::new(&character), &packets(&character, 40));
+    let mut seed = 1u32;
+    let mut random = move || {
+        seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (seed >> 16) as usize
+    };
+    for round in 0..2000 {
+        let mut bytes = batch.clone();
+        for _ in 0..1 + round % 3 {
+            let at = random() % bytes.len();
+            bytes[at] = random() as u8;
+        }
+        bytes.truncate(1 + random() % bytes.len());
+        // What it gives is anybody's guess; that it comes back is not.
+        let _ = unpack(&mut BatchReader::new(&character), &bytes);
+    }
+    assert_eq!(unpack(&mut BatchReader::new(&character), &[]), Err(BatchError::Version { got: 0 }));
+    assert_eq!(unpack(&mut BatchReader::new(&character), &[0x21, 0, 0xFF, 0xFF, 3]), Err(BatchError::TooLarge));
+}
