@@ -1,8 +1,9 @@
-//! Feed files: the publish messages of one session, one a line (`.jsonl`), a recording of Live Link Face (`.csv`), or one of
-//! our own (`.mcap`).
+//! Feed files: the publish messages of one session, one a line (`.jsonl`), a recording of Live Link Face or a log of
+//! OpenSeeFace (`.csv`), or one of our own (`.mcap`).
 
 use crate::recording::RecordedFeed;
 use crate::trackers::livelink_csv::LiveLinkCsv;
+use crate::trackers::openseeface_csv::{self, OpenSeeFaceCsv};
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
 use std::fs::File;
@@ -156,14 +157,24 @@ impl<R: BufRead> Feed<R> {
 fn open(path: &Path) -> Result<(FeedLines, String), FeedError> {
     let shown = path.display().to_string();
     let file = File::open(path).map_err(|source| FeedError::Io { path: shown.clone(), source })?;
-    let lines = BufReader::with_capacity(1 << 16, file);
+    let mut lines = BufReader::with_capacity(1 << 16, file);
     let has_ending = |ending: &str| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(ending));
     if has_ending("mcap") {
         let feed = RecordedFeed::open(path).map_err(|error| FeedError::Io { path: shown.clone(), source: std::io::Error::other(error) })?;
         return Ok((Box::new(feed), shown));
     }
-    let is_recording = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("csv"));
-    Ok((if is_recording { Box::new(BufReader::new(LiveLinkCsv::new(lines))) } else { Box::new(lines) }, shown))
+    if !has_ending("csv") {
+        return Ok((Box::new(lines), shown));
+    }
+    // Two programs write tables; their headers tell them apart.
+    let beginning = lines.fill_buf().map_err(|source| FeedError::Io { path: shown.clone(), source })?;
+    let is_openseeface = beginning.starts_with(openseeface_csv::BEGINNING.as_bytes());
+    let lines: FeedLines = if is_openseeface {
+        Box::new(BufReader::new(OpenSeeFaceCsv::new(lines)))
+    } else {
+        Box::new(BufReader::new(LiveLinkCsv::new(lines)))
+    };
+    Ok((lines, shown))
 }
 
 const NO_HELLO: &str = "the first line must be {\"type\":\"hello\",\"version\":1,…}";

@@ -13,6 +13,7 @@ pub(crate) mod listen;
 pub mod livelink;
 pub mod livelink_csv;
 pub mod openseeface;
+pub mod openseeface_csv;
 pub mod osc;
 pub(crate) mod session;
 pub mod sniff;

@@ -1,0 +1,208 @@
+//! OpenSeeFace's log (`--log-data`, CSV) as a feed. Its header names 66 landmarks while its rows hold 68, so columns behind the first
+//! landmark are bound by their place.
+//!
+//! ```text
+//! Frame,Time,Width,Height,FPS,Face,FaceID,…,TVec.Z,Landmark[0].X,Landmark[0].Y,Landmark[0].Confidence,…
+//! 12,1700000000.25,640,480,24,0,0,…                  Unix seconds; X to the right, Y down, pixels
+//! ```
+//! Of several faces the first of each camera frame is taken; where none is logged for a while, the feed says that there is no face.
+
+use super::openseeface::NUM_POINTS;
+use std::fmt::Write;
+use std::io::{self, BufRead, Read};
+
+/// What its header begins with.
+pub const BEGINNING: &str = "Frame,Time,Width,Height,";
+/// Longest line, bytes: 453 numbers of 24 digits take 11,300.
+const LONGEST_LINE: u64 = 64 << 10;
+/// Column of the first landmark.
+const FIRST_LANDMARK: usize = 25;
+/// Rows farther apart than this, seconds, have no face between them: the tracker logs every camera frame that has one.
+const LONGEST_STEP: f64 = 0.5;
+/// Largest side of a picture and farthest landmark, pixels.
+const FARTHEST: f64 = 1e5;
+
+/// Reads a log as the lines of a feed: a hello, then one frame a row.
+pub struct OpenSeeFaceCsv<R> {
+    lines: R,
+    line: usize,
+    image: Option<[f64; 2]>,
+    last_t: Option<f64>,
+    text: Vec<u8>,
+    at: usize,
+}
+
+impl<R: BufRead> OpenSeeFaceCsv<R> {
+    /// A reader that begins with the header's line.
+    pub fn new(lines: R) -> Self {
+        Self { lines, line: 0, image: None, last_t: None, text: Vec::new(), at: 0 }
+    }
+
+    /// The next lines of the feed into `text`; false at the end.
+    fn next_lines(&mut self) -> io::Result<bool> {
+        loop {
+            let mut bytes = Vec::new();
+            self.line += 1;
+            let wrong = |problem: String| io::Error::new(io::ErrorKind::InvalidData, format!("line {}: {problem}", self.line));
+            if (&mut self.lines).take(LONGEST_LINE).read_until(b'\n', &mut bytes)? == 0 {
+                return if self.image.is_none() { Err(wrong("the log has no rows".into())) } else { Ok(false) };
+            }
+            if bytes.len() as u64 == LONGEST_LINE && bytes.last() != Some(&b'\n') {
+                return Err(wrong(format!("it is longer than {LONGEST_LINE} bytes")));
+            }
+            let row = std::str::from_utf8(&bytes).map_err(|_| wrong("it is not UTF-8 text".into()))?.trim_end();
+            if self.line == 1 {
+                if !row.starts_with(BEGINNING) || row.split(',').nth(FIRST_LANDMARK) != Some("Landmark[0].X") {
+                    return Err(wrong(format!("it is no header of OpenSeeFace, expected {BEGINNING}…")));
+                }
+                continue;
+            }
+            if row.is_empty() {
+                continue;
+            }
+            let row = Row::read(row).map_err(wrong)?;
+            let mut text = String::new();
+            if self.take(&row, &mut text) {
+                (self.text, self.at) = (text.into_bytes(), 0);
+                return Ok(true);
+            }
+        }
+    }
+
+    /// Writes what a row adds to the feed; false for one that adds nothing.
+    fn take(&mut self, row: &Row, text: &mut String) -> bool {
+        // Another face of the same picture, or a clock that was set back.
+        if row.face != 0 || self.last_t.is_some_and(|last| row.t <= last) {
+            return false;
+        }
+        if self.image.is_none() {
+            let [width, height] = *self.image.insert(row.image);
+            // Its own camera has a focal length of the picture's width.
+            let _ = writeln!(
+                text,
+                r#"{{"type":"hello","version":1,"source":"OpenSeeFace log","layout":"openseeface66","image":[{width},{height}],"focal":{width}}}"#
+            );
+        }
+        if let Some(last) = self.last_t.filter(|last| row.t - last > LONGEST_STEP) {
+            let _ = writeln!(text, r#"{{"type":"frame","t":{},"face":false}}"#, last + LONGEST_STEP / 2.0);
+        }
+        self.last_t = Some(row.t);
+        let _ = write!(text, r#"{{"type":"frame","t":{},"landmarks":["#, row.t);
+        for (i, [x, y, _]) in row.landmarks.iter().enumerate() {
+            let _ = write!(text, "{}[{x},{y}]", if i == 0 { "" } else { "," });
+        }
+        text.push_str("],\"confidence\":[");
+        for (i, [.., confidence]) in row.landmarks.iter().enumerate() {
+            let _ = write!(text, "{}{confidence}", if i == 0 { "" } else { "," });
+        }
+        text.push_str("]}\n");
+        true
+    }
+}
+
+/// A row that has been checked.
+struct Row {
+    t: f64,
+    image: [f64; 2],
+    /// Counts the faces of one picture.
+    face: u32,
+    /// X, Y and confidence.
+    landmarks: [[f64; 3]; NUM_POINTS],
+}
+
+impl Row {
+    fn read(row: &str) -> Result<Self, String> {
+        let mut cells = row.split(',');
+        let mut number = |name: &str, range: std::ops::RangeInclusive<f64>| {
+            let cell = cells.next().ok_or_else(|| format!("it ends before {name}"))?.trim();
+            let shown = || cell.chars().take(40).collect::<String>();
+            let value = cell.parse::<f64>().ok().filter(|value| range.contains(value));
+            value.ok_or_else(|| format!("{name} is {:?}, expected a number from {} to {}", shown(), range.start(), range.end()))
+        };
+        number("Frame", 0.0..=1e15)?;
+        let t = number("Time", 0.0..=rhytid_shared::limits::MAX_SECONDS)?;
+        let image = [number("Width", 1.0..=FARTHEST)?, number("Height", 1.0..=FARTHEST)?];
+        number("FPS", -1e6..=1e6)?;
+        let face = number("Face", 0.0..=1000.0)? as u32;
+        // The tracker's own fit, some of it in brackets.
+        let mut cells = row.split(',').skip(FIRST_LANDMARK);
+        let mut landmarks = [[0.0; 3]; NUM_POINTS];
+        for (i, landmark) in landmarks.iter_mut().enumerate() {
+            for (value, most) in landmark.iter_mut().zip([FARTHEST, FARTHEST, 1e3]) {
+                let cell = cells.next().ok_or_else(|| format!("it ends before landmark {i}"))?.trim();
+                let read = cell.parse::<f64>().ok().filter(|read| read.abs() <= most);
+                *value =
+                    read.ok_or_else(|| format!("landmark {i} has {:?}, expected a number", cell.chars().take(40).collect::<String>()))?;
+            }
+            landmark[2] = landmark[2].clamp(0.0, 1.0);
+        }
+        Ok(Self { t, image, face, landmarks })
+    }
+}
+
+impl<R: BufRead> Read for OpenSeeFaceCsv<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        if self.at == self.text.len() && !self.next_lines()? {
+            return Ok(0);
+        }
+        let count = buffer.len().min(self.text.len() - self.at);
+        buffer[..count].copy_from_slice(&self.text[self.at..self.at + count]);
+        self.at += count;
+        Ok(count)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::feed::{Feed, FeedItem};
+    use rhytid_shared::{TrackingData, TrackingFrame};
+
+    fn header() -> String {
+        let named = |kind: &str| (0..66).map(|i| format!(",{kind}[{i}].X,{kind}[{i}].Y,{kind}[{i}].Confidence")).collect::<String>();
+        let fit = "RotationQuat.X,RotationQuat.Y,RotationQuat.Z,RotationQuat.W,Euler.X,Euler.Y,Euler.Z,RVec.X,RVec.Y,RVec.Z";
+        let first = "Frame,Time,Width,Height,FPS,Face,FaceID,RightOpen,LeftOpen,AverageConfidence,Success3D,PnPError";
+        format!("{first},{fit},TVec.X,TVec.Y,TVec.Z{}{}\r\n", named("Landmark"), named("Point3D"))
+    }
+
+    /// As the program writes it: 68 landmarks, 70 points, some values in brackets.
+    fn row(t: f64, face: u32, offset: f64) -> String {
+        let landmarks: String = (0..68).map(|i| format!(",{},{},0.5", 100.0 + f64::from(i) + offset, 50 + i)).collect();
+        let fit = "1.0,0.9,0.8,True,[0.3],0,0,0,1,0,0,0,[1.0],[2.0],[3.0],0,0,5";
+        format!("1,{t},640,480,24,{face},0,{fit}{landmarks}{}\r\n", ",0.0".repeat(210))
+    }
+
+    #[test]
+    fn rows_become_frames_and_gaps_faces_that_are_lost() {
+        let text = header() + &row(10.0, 0, 0.0) + &row(10.0, 1, 9.0) + &row(10.04, 0, 1.0) + "\r\n" + &row(12.0, 0, 2.0);
+        let lines = std::io::BufReader::new(OpenSeeFaceCsv::new(text.as_bytes()));
+        let mut feed = Feed::new_for_any_character(lines, "log".into()).unwrap();
+        assert_eq!((feed.hello.image, feed.hello.focal), (Some([640.0, 480.0]), Some(640.0)));
+        let (mut frame, mut seen) = (TrackingFrame::default(), Vec::new());
+        while let Some(FeedItem::Frame) = feed.next_frame(&mut frame).unwrap() {
+            seen.push((
+                frame.t,
+                match &frame.data {
+                    TrackingData::Landmarks { points, confidence } => {
+                        assert_eq!((points.len(), confidence.len(), confidence[65]), (66, 66, 0.5));
+                        Some(points[65])
+                    }
+                    _ => None,
+                },
+            ));
+        }
+        assert_eq!(seen[..2], [(10.0, Some([165.0, 115.0, 0.0])), (10.04, Some([166.0, 115.0, 0.0]))]);
+        assert!(seen.len() == 4 && seen[2].1.is_none() && (10.04..12.0).contains(&seen[2].0) && seen[3].0 == 12.0, "{seen:?}");
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        let says = |text: &str| OpenSeeFaceCsv::new(text.as_bytes()).read_to_string(&mut String::new()).unwrap_err().to_string();
+        assert!(says("").contains("the log has no rows"));
+        assert!(says("Frame,Time,Width,Height,x\n").contains("it is no header of OpenSeeFace"));
+        assert!(says(&(header() + "1,2,640\n")).contains("line 2: it ends before Height"), "{}", says(&(header() + "1,2,640\n")));
+        assert!(says(&(header() + &row(1.0, 0, 0.0).replace("480", "NaN"))).contains("Height is \"NaN\""));
+        assert!(says(&(header() + &row(1.0, 0, 1e9))).contains("landmark 0 has"));
+        assert!(says(&(header() + &"9".repeat(70_000))).contains("longer than"));
+    }
+}
