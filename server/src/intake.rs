@@ -99,10 +99,9 @@ impl Intake {
         }
         hub.metrics.solve_seconds.observe(start.elapsed().as_secs_f64());
         let kind = self.pipeline.encode(&mut self.packet);
-        if is_recorded && let Some(text) = made.or_else(|| message.cloned()) {
-            self.place.record(|| Item::Text { slot: self.slot.clone(), t: Some(frame.t), text });
-        }
-        if !self.place.publish(kind, &self.packet, self.pipeline.face()) {
+        let text = made.or_else(|| message.filter(|_| is_recorded).cloned());
+        let message = text.map(|text| Item::Text { slot: self.slot.clone(), t: Some(frame.t), text });
+        if !self.place.publish(kind, &self.packet, self.pipeline.face(), message) {
             return Ok(false);
         }
         hub.metrics.frames_in.inc();
@@ -134,7 +133,7 @@ impl Intake {
     /// The end of the session: what has refined the neutral since it was told of is kept.
     pub fn end(&self) {
         self.keep_neutral();
-        self.place.record(|| Item::Event(SessionEvent::End { session: self.place.session, frames: self.num_frames }));
+        self.place.record_end(self.num_frames);
         tracing::info!(room = %self.place.room.name, session = self.place.session, frames = self.num_frames, "publisher gone");
     }
 }

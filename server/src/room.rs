@@ -354,8 +354,9 @@ pub(crate) struct Publishing {
 pub(crate) type Evicted = oneshot::Receiver<()>;
 
 impl Publishing {
-    /// Makes `packet` the room's newest state. False where another publisher has the room.
-    pub fn publish(&self, kind: PacketKind, packet: &[u8], face: &FaceFrame) -> bool {
+    /// Makes `packet` the room's newest state, and records it behind `message`, which it was made of. False where another publisher has
+    /// the room.
+    pub fn publish(&self, kind: PacketKind, packet: &[u8], face: &FaceFrame, message: Option<Item>) -> bool {
         let mut state = lock(&self.room.state);
         if state.publisher.as_ref().is_none_or(|publisher| publisher.session != self.session) {
             return false;
@@ -364,6 +365,9 @@ impl Publishing {
         let index = state.num_states;
         let bytes = Bytes::copy_from_slice(packet);
         if let Some(sink) = &state.recording {
+            if let Some(message) = message {
+                sink.put(message);
+            }
             sink.put(Item::Packet(bytes.clone()));
         }
         let (key, delta) = match (kind, &state.key) {
@@ -377,10 +381,20 @@ impl Publishing {
         true
     }
 
-    /// Records what `item` gives, where the room is recorded.
+    /// Records what `item` gives, where the room is recorded and nobody else has it.
     pub fn record(&self, item: impl FnOnce() -> Item) {
-        if let Some(sink) = &lock(&self.room.state).recording {
+        let state = lock(&self.room.state);
+        if let (Some(sink), Some(publisher)) = (&state.recording, &state.publisher)
+            && publisher.session == self.session
+        {
             sink.put(item());
+        }
+    }
+
+    /// Records that the session is over, whoever has the room by now.
+    pub fn record_end(&self, frames: u64) {
+        if let Some(sink) = &lock(&self.room.state).recording {
+            sink.put(Item::Event(SessionEvent::End { session: self.session, frames }));
         }
     }
 

@@ -319,7 +319,7 @@ impl<'a> Player<'a> {
             if self.status.playing {
                 self.play()?;
             } else {
-                self.send();
+                self.send(Instant::now());
             }
             *lock(shared) = self.status.clone();
         }
@@ -353,10 +353,10 @@ impl<'a> Player<'a> {
                 (self.status.playing, self.status.position) = (false, self.status.to);
                 return Ok(());
             }
-            let is_due = self.status.speed.is_infinite() || self.due().is_some_and(|due| due <= now);
-            let Some(next) = self.next.filter(|_| is_due) else { return Ok(()) };
+            let due = if self.status.speed.is_infinite() { Some(now) } else { self.due().filter(|due| *due <= now) };
+            let (Some(next), Some(due)) = (self.next, due) else { return Ok(()) };
             self.shown.clone_from(self.faces.frame());
-            self.send();
+            self.send(due);
             self.status.position = self.status.position.max(next.smooth);
             self.next = self.faces.advance()?;
         }
@@ -401,7 +401,7 @@ impl<'a> Player<'a> {
     fn go_to(&mut self, position: f64) -> Result<(), ReadError> {
         if self.faces.seek(position)?.is_some() {
             self.shown.clone_from(self.faces.frame());
-            self.send();
+            self.send(Instant::now());
             self.next = self.faces.advance()?;
         } else {
             self.next = None;
@@ -411,9 +411,9 @@ impl<'a> Player<'a> {
         Ok(())
     }
 
-    /// Sends the face that is shown, as of now.
-    fn send(&mut self) {
-        let now = self.begun.elapsed().as_micros() as u64;
+    /// Sends the face that is shown as of `at`: when it was due, not when this thread woke.
+    fn send(&mut self, at: Instant) {
+        let now = at.saturating_duration_since(self.begun).as_micros() as u64;
         // Two faces of one time would be one.
         let micros = self.last_micros.map_or(now, |last| now.max(last + 1));
         self.last_micros = Some(micros);
@@ -423,6 +423,6 @@ impl<'a> Player<'a> {
         self.num_frames = self.num_frames.wrapping_add(1);
         let kind = self.encoder.encode(&self.shown, &mut self.packet);
         // An eviction is noticed by the loop.
-        self.seat.place.publish(kind, &self.packet, &self.shown);
+        self.seat.place.publish(kind, &self.packet, &self.shown, None);
     }
 }
