@@ -72,6 +72,9 @@ pub enum PictureError {
         /// The one given.
         given: String,
     },
+    /// A neutral face is given or asked for where packets are drawn.
+    #[error("a recording's packets are drawn as they are, without --calibration and --save-calibration")]
+    NoChoice,
     /// The video.
     #[error(transparent)]
     Video(#[from] VideoError),
@@ -375,7 +378,7 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
 /// Draws the packets of a recording as they went out.
 fn render_recording(args: &RenderArgs) -> Result<usize> {
     if args.calibration.is_some() || args.save_calibration.is_some() {
-        return Err(PictureError::Lacks("neutral face to choose: a recording's packets are drawn as they are"));
+        return Err(PictureError::NoChoice);
     }
     let mut faces = Faces::new(Recording::open(&args.feed)?);
     let mut output = Output::open(args)?;

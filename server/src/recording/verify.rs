@@ -183,7 +183,14 @@ impl Run<'_> {
                 read.map_err(|error| recording.broken_batch(entry.log_time, &error))?;
                 packets.iter().try_for_each(|packet| self.compare(packet))
             }
-            Topic::Binary(_) | Topic::Refused(_) => Ok(()),
+            Topic::Binary(slot) => match self.slots.get(slot) {
+                Some(Solving { session, .. }) => {
+                    let problem = "it is binary, which this version does not read".to_owned();
+                    Err(VerifyError::Refused { session: *session, seconds: self.seconds(entry), problem })
+                }
+                None => Ok(()),
+            },
+            Topic::Refused(_) => Ok(()),
         }
     }
 

@@ -113,6 +113,7 @@ pub(crate) enum Item {
         text: Utf8Bytes,
     },
     /// A binary message that was taken.
+    #[allow(dead_code, reason = "publishers may not send any yet; the format has a place for them")]
     Binary {
         slot: Arc<str>,
         t: Option<f64>,
@@ -222,8 +223,10 @@ impl Recorder {
                     tracing::error!(file, error, "recording failed; the stream goes on");
                 }
             }
+            // Before the room is told, so that another may begin at once.
+            drop(place);
             *lock(&shared.end) = Some(ended.err().unwrap_or_default());
-            drop((place, keeps));
+            drop(keeps);
         };
         let thread = std::thread::Builder::new().name("recording".into());
         thread.spawn(run).map_err(|source| RecordError::Create { path: "a thread".into(), source })?;
