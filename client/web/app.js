@@ -20,7 +20,7 @@ const NUMBERS = 500;
 /** The views that have a key of their own, in the order of the keys 1 to 6. */
 const VIEWS = ["beauty", "bare", "split", "influence", "normals", "wireframe"];
 const CHOICES = {
-  wrinkles: [["own", "As chosen"], ["bones", "Poses"], ["zones", "Zones"], ["both", "Both"], ["off", "Off"]],
+  wrinkles: [["own", "Automatic"], ["bones", "Poses"], ["zones", "Zones"], ["both", "Both"], ["off", "Off"]],
   light: [["portrait", "Portrait"], ["sunset", "Sunset"]],
   deform: [["bones", "Bones"], ["shapes", "Shapes"]],
 };

@@ -3,7 +3,7 @@
 import { PublishLink, publishSentence } from "./publish_link.js";
 import { EXPRESSION_FACES, REGIONS, SHAPES, label, mirrored } from "./names.js";
 import { PuppetFace } from "./puppet_face.js";
-import { element, wallClock } from "./util.js";
+import { element, fillTrack, wallClock } from "./util.js";
 
 /** Milliseconds between two frames while something moves: 30 a second with a margin for the timer. */
 const MOVING = 33;
@@ -53,6 +53,7 @@ export class Puppet {
       element("h2", {}, "Reference poses"), this.poses,
       element("h2", {}, "Shapes"), ...regions);
     this.setExpressions(Object.keys(EXPRESSION_FACES));
+    this.#show();
   }
 
   /** @param {string[]} names */
@@ -99,6 +100,7 @@ export class Puppet {
     for (const [key, { input, output, row }] of this.rows) {
       const value = this.face.targets.get(key) ?? 0;
       if (Number(input.value) !== value) input.value = String(value);
+      fillTrack(input);
       output.textContent = String(Math.round(100 * value));
       row.classList.toggle("active", value > 0);
     }

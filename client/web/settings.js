@@ -1,6 +1,6 @@
 // How the server treats what this tracker sends: smoothing, gains, mirror. Changed while frames come.
 
-import { element, storage } from "./util.js";
+import { element, fillTrack, storage } from "./util.js";
 
 /** Groups of the smoothing; the server tells the delay of lids as that of eyelids. */
 const SMOOTHING = [["brows", "Brows"], ["lids", "Lids"], ["mouth", "Mouth"], ["head", "Head"]];
@@ -111,6 +111,7 @@ export class Settings {
       const [kind, name] = key.split(".");
       const value = Number(this.values[kind]?.[name] ?? 1);
       if (Number(input.value) !== value) input.value = String(value);
+      fillTrack(input);
       const delay = this.delays[name] ?? this.delays[name === "lids" ? "eyelids" : name];
       const shown = kind === "smoothing" && value === 0 ? "raw" : `× ${value.toFixed(2)}`;
       output.textContent = kind === "smoothing" && Number.isFinite(delay) ? `${shown} · ${Math.round(1000 * delay)} ms` : shown;

@@ -21,13 +21,20 @@ export class FaceTracker {
   static async load() {
     if (!("FaceMesh" in window)) await addScript(`${FILES}face_mesh.js`);
     const mesh = new (/** @type {any} */ (window).FaceMesh)({ locateFile: (/** @type {string} */ file) => FILES + file });
-    mesh.setOptions({ maxNumFaces: 1, refineLandmarks: true, minDetectionConfidence: 0.5, minTrackingConfidence: 0.5, selfieMode: false });
     const tracker = new FaceTracker(mesh);
-    const tooLate = new Promise((_, reject) => setTimeout(() => reject(new Error("it took longer than a minute")), PATIENCE));
+    /** @type {number | undefined} */
+    let timer;
+    const tooLate = new Promise((_, reject) => (timer = setTimeout(() => reject(new Error("it took longer than a minute")), PATIENCE)));
     try {
-      await Promise.race([mesh.initialize(), tooLate]);
+      // The least confidence of a detection stays as it is: this version of the tracker aborts where it is set at all.
+      const ready = mesh.initialize()
+        .then(() => mesh.setOptions({ maxNumFaces: 1, refineLandmarks: true, minTrackingConfidence: 0.5, selfieMode: false }))
+        .then(() => mesh.send({ image: blank() }));
+      await Promise.race([ready, tooLate]);
     } catch (error) {
       throw new Error(`The face tracker cannot be loaded: ${error instanceof Error ? error.message : error}.`);
+    } finally {
+      clearTimeout(timer);
     }
     return tracker;
   }
@@ -50,6 +57,13 @@ export class FaceTracker {
     });
     return points.every(Number.isFinite);
   }
+}
+
+/** A picture without a face: what the tracker makes ready at its first picture, it makes ready before the first real one. */
+function blank() {
+  const canvas = Object.assign(document.createElement("canvas"), { width: 64, height: 64 });
+  canvas.getContext("2d")?.fillRect(0, 0, 64, 64);
+  return canvas;
 }
 
 /** @param {string} address @returns {Promise<void>} */

@@ -29,6 +29,12 @@ export function element(tag, properties = {}, ...children) {
   return made;
 }
 
+/** Colours a slider's track up to its thumb. @param {HTMLInputElement} input */
+export function fillTrack(input) {
+  const [least, most] = [Number(input.min), Number(input.max)];
+  input.style.setProperty("--fill", `${(100 * (Number(input.value) - least)) / (most - least)}%`);
+}
+
 /** @param {number} value @param {number} least @param {number} most */
 export const clamp = (value, least, most) => Math.min(most, Math.max(least, value));
 
