@@ -268,7 +268,11 @@ function greatest(values, from, length) {
 }
 
 /** @param {number} value */
-const millis = (value) => (Number.isFinite(value) ? `${value < 9.95 ? value.toFixed(1) : Math.round(value)} ms` : "–");
+function millis(value) {
+  if (!Number.isFinite(value)) return "–";
+  if (value < 0.95) return `${Math.round(1000 * Math.max(0, value))} µs`;
+  return `${value < 9.95 ? value.toFixed(1) : Math.round(value)} ms`;
+}
 
 /**
  * @param {HTMLElement | undefined} list @param {string[]} names @param {number[]} values
