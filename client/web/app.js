@@ -9,6 +9,7 @@ import { listenForCopies, showLinks } from "./share.js";
 import { Stage, expressionNames, fetchCharacter } from "./stage.js";
 import { byId, element, roomOfAddress, storage, wallClock } from "./util.js";
 import { ViewLink } from "./view_link.js";
+import { FaceViewer } from "./viewer.js";
 import { PacketTimes } from "./wire.js";
 
 const parameters = new URLSearchParams(location.search);
@@ -41,7 +42,7 @@ const KEYS = [
   [["?"], "This list"],
 ];
 
-/** @type {import("./stage.js").Viewer | null} */
+/** @type {FaceViewer | null} */
 let viewer = null;
 /** @type {ViewLink | null} */
 let link = null;
@@ -50,7 +51,6 @@ let linkDetail = "";
 let room = roomOfAddress();
 /** The character of the last hello. @type {any} */
 let character = null;
-let loadedHash = "";
 let problem = "";
 let view = "beauty";
 let poseShown = -1;
@@ -115,7 +115,7 @@ function enter(name, isNew) {
   tellCamera({ type: "room", room: name });
   if (!byId("page-share").hidden) showLinks(name);
   link?.close();
-  viewer?.linkLost(performance.now());
+  viewer?.linkLost();
   problem = "";
   openLink();
 }
@@ -125,12 +125,12 @@ function openLink() {
     hello: (text) => greeted(text),
     packet: (bytes) => {
       const now = performance.now();
-      if (character?.sha256 === loadedHash) viewer?.packet(bytes, now);
+      viewer?.packet(bytes, now);
       const read = times.read(bytes);
       if (read) inspector.packetArrived(read.micros, wallClock());
     },
     state: (state, detail) => {
-      if (state === "lost" && linkState === "open") viewer?.linkLost(performance.now());
+      if (state === "lost" && linkState === "open") viewer?.linkLost();
       linkState = state;
       linkDetail = detail;
       showState();
@@ -140,26 +140,42 @@ function openLink() {
 
 /** The view socket's hello: on to its character. @param {string} text */
 async function greeted(text) {
-  const hello = JSON.parse(text);
-  const isOther = hello.character.sha256 !== loadedHash;
-  character = hello.character;
+  if (!viewer) return;
   try {
-    if (isOther) {
-      const glb = await fetchCharacter(character);
-      if (character.sha256 !== hello.character.sha256 || !viewer) return;
-      await viewer.loadCharacter(glb);
-      loadedHash = hello.character.sha256;
+    const hello = JSON.parse(text);
+    viewer.hello(text);
+    const isOther = hello.character.sha256 !== character?.sha256;
+    character = hello.character;
+    if (hello.character.sha256 !== viewer.loadedHash) {
+      const glb = await fetchCharacter(hello.character);
+      // Another hello may have come meanwhile.
+      if (character.sha256 !== hello.character.sha256) return;
+      viewer.load(glb, hello.character.sha256);
       puppet.setExpressions(expressionNames(glb));
+    }
+    if (isOther) {
       puppet.setCharacter(character);
       inspector.setCharacter(character);
-      showViews();
+      poseShown = -1;
     }
-    viewer?.hello(text);
+    view = viewer.view;
+    showViews();
+    markView();
     problem = "";
   } catch (error) {
     problem = sentence(error);
   }
   showState();
+}
+
+/** The graphics device is gone: a fresh page gets another. Once a minute, or a broken driver would keep it reloading. */
+function drawingFailed(/** @type {unknown} */ error) {
+  problem = `${sentence(error)}. Reload the page.`;
+  showState();
+  const last = Number(sessionStorage.getItem("rhytid.reloaded") ?? 0);
+  if (Date.now() - last < 60_000) return;
+  sessionStorage.setItem("rhytid.reloaded", String(Date.now()));
+  setTimeout(() => location.reload(), 1500);
 }
 
 /** @param {unknown} error */
@@ -189,7 +205,7 @@ function showState() {
     [kind, detail] = ["gone", linkDetail || "The server does not answer"];
   } else if (linkState === "open") {
     const state = viewer?.stats().state ?? "waiting";
-    kind = state === "facelost" || state === "face_lost" || state === "face lost" ? "lost" : state in WORDS ? state : "waiting";
+    kind = state in WORDS ? state : "waiting";
   }
   const [color, headline, text] = WORDS[/** @type {keyof typeof WORDS} */ (kind)];
   const shown = kind + detail;
@@ -211,7 +227,7 @@ function showNumbers() {
   if (!stats) return;
   const isMoving = linkState === "open" && stats.bytesPerSecond > 0;
   byId("number-fps").textContent = stats.fps < 9.95 ? stats.fps.toFixed(1) : String(Math.round(stats.fps));
-  byId("number-latency").textContent = isMoving && Number.isFinite(stats.latencyMs) ? `${Math.round(stats.latencyMs)} ms` : "–";
+  byId("number-latency").textContent = isMoving ? `${Math.round(stats.playoutDelayMs + stats.drawMs)} ms` : "–";
   const bytes = isMoving ? stats.bytesPerSecond : 0;
   byId("number-bytes").textContent = bytes < 1000 ? `${Math.round(bytes)} B/s` : `${(bytes / 1000).toFixed(1)} kB/s`;
 }
@@ -219,7 +235,8 @@ function showNumbers() {
 // Switches.
 
 function showViews() {
-  const all = viewer?.views() ?? VIEWS;
+  const known = viewer?.views() ?? [];
+  const all = known.length ? known : VIEWS;
   // Those with a key first; the terms of the light are one press further.
   const names = [...VIEWS.filter((name) => all.includes(name)), ...all.filter((name) => !VIEWS.includes(name) && !name.includes(":"))];
   const group = byId("views");
@@ -275,12 +292,12 @@ function chooseView(name) {
   markView();
 }
 
-/** @param {"wrinkles" | "light" | "deform"} name @param {string} value */
-function setSwitch(name, value) {
+/** @param {"wrinkles" | "light" | "deform"} name @param {string} value @param {boolean} isKept */
+function setSwitch(name, value, isKept = true) {
   try {
     viewer?.setSwitch(name, value);
     byId(name).value = value;
-    storage.write(name, value);
+    if (isKept) storage.write(name, value);
   } catch (error) {
     console.warn(sentence(error));
   }
@@ -372,32 +389,27 @@ async function start() {
   puppet.room = room;
   const canvas = /** @type {HTMLCanvasElement} */ (/** @type {unknown} */ (byId("face")));
   try {
-    const module = await import("./rhytid_client.js");
-    await module.default();
-    const backend = parameters.get("backend") ?? "auto";
-    viewer = await module.Viewer.start(canvas, { backend, transparent: isTransparent });
+    viewer = await FaceViewer.start(canvas, { backend: parameters.get("backend") ?? "auto", transparent: isTransparent });
   } catch (error) {
     problem = sentence(error);
     showState();
     return;
   }
-  const started = /** @type {import("./stage.js").Viewer} */ (viewer);
+  const started = viewer;
   byId("backend").textContent = `Drawn with ${started.backend()}.`;
   document.documentElement.dataset.backend = started.backend();
   for (const name of /** @type {("wrinkles" | "light" | "deform")[]} */ (Object.keys(CHOICES))) {
     const asked = parameters.get(name);
     // What the address says is for this page alone.
-    if (asked) {
-      started.setSwitch(name, asked);
-      byId(name).value = asked;
-    } else {
-      setSwitch(name, storage.read(name) ?? CHOICES[name][0][0]);
-    }
+    setSwitch(name, asked ?? storage.read(name) ?? CHOICES[name][0][0], !asked);
   }
   showViews();
   new Stage(canvas, started, (now) => {
-    if (inspector.isOpen) inspector.pictureShown(started.frame(), started.stats().latencyMs, now);
-  });
+    const frame = inspector.isOpen ? started.frame() : null;
+    if (!frame) return;
+    const { playoutDelayMs, drawMs } = started.stats();
+    inspector.pictureShown(frame, playoutDelayMs + drawMs, now);
+  }, drawingFailed);
   chooseView(parameters.get("view") ?? "beauty");
   setInterval(showNumbers, NUMBERS);
   openLink();

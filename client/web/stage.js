@@ -2,26 +2,6 @@
 
 import { clamp } from "./util.js";
 
-/**
- * What the WebAssembly module's class offers, as far as the page uses it.
- * @typedef {object} Viewer
- * @property {() => string} backend
- * @property {(glb: Uint8Array) => Promise<void> | void} loadCharacter
- * @property {(text: string) => void} hello
- * @property {(bytes: Uint8Array, nowMs: number) => void} packet
- * @property {(nowMs: number) => void} linkLost
- * @property {(width: number, height: number) => void} resize
- * @property {(nowMs: number) => boolean} draw
- * @property {(dx: number, dy: number) => void} orbit
- * @property {(factor: number) => void} zoom
- * @property {() => void} resetCamera
- * @property {(name: string) => void} setView
- * @property {() => string[]} views
- * @property {(name: string, value: string) => void} setSwitch
- * @property {() => {fps: number, latencyMs: number, bytesPerSecond: number, packets: number, face: boolean, state: string, drawMs: number}} stats
- * @property {() => {t: number, seq: number, session: number, face: boolean, bones: Float32Array, influence: Float32Array, zones: Float32Array, shapes: Float32Array}} frame
- */
-
 /** Most pixels of a picture for each of the page's: what a phone's dense screen asks beyond that, nobody sees on skin. */
 const MOST_DENSITY = 2;
 /** Pointer travel of one press of an arrow key, page pixels. */
@@ -31,10 +11,11 @@ const KEY_TRAVEL = 24;
 export class Stage {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {Viewer} viewer
+   * @param {import("./viewer.js").FaceViewer} viewer
    * @param {(nowMs: number) => void} drawn called after a picture was drawn
+   * @param {(error: unknown) => void} failed called once, when nothing can be drawn any more
    */
-  constructor(canvas, viewer, drawn) {
+  constructor(canvas, viewer, drawn, failed) {
     this.canvas = canvas;
     this.viewer = viewer;
     this.drawn = drawn;
@@ -44,8 +25,13 @@ export class Stage {
     new ResizeObserver(() => this.#fit()).observe(canvas);
     this.#listen();
     const tick = (/** @type {number} */ now) => {
+      try {
+        if (this.viewer.draw(now)) this.drawn(now);
+      } catch (error) {
+        failed(error);
+        return;
+      }
       requestAnimationFrame(tick);
-      if (this.viewer.draw(now)) this.drawn(now);
     };
     requestAnimationFrame(tick);
   }
