@@ -336,7 +336,7 @@ function obey(key) {
   } else if (key === "f") toggleFullScreen();
   else if (key === "c") tellCamera({ type: "calibrate" });
   else if (key === "x") tellCamera({ type: "recentre" });
-  else if (key === "?") /** @type {any} */ (byId("help")).showModal();
+  else if (key === "?") byId("help").showModal();
   else return false;
   return true;
 }
@@ -370,7 +370,8 @@ function listen() {
     element("dt", {}, .../** @type {string[]} */ (keys).map((key) => (key === "–" ? "–" : element("kbd", {}, key)))),
     element("dd", {}, /** @type {string} */ (what)),
   ]));
-  const help = /** @type {HTMLDialogElement} */ (/** @type {unknown} */ (byId("help")));
+  /** @type {HTMLDialogElement} */
+  const help = byId("help");
   help.addEventListener("click", (event) => {
     if (event.target === help) help.close();
   });
@@ -387,7 +388,7 @@ async function start() {
   document.title = `${room} · Rhytid`;
   picker.current = room;
   puppet.room = room;
-  const canvas = /** @type {HTMLCanvasElement} */ (/** @type {unknown} */ (byId("face")));
+  const canvas = byId("face");
   try {
     viewer = await FaceViewer.start(canvas, { backend: parameters.get("backend") ?? "auto", transparent: isTransparent });
   } catch (error) {

@@ -85,7 +85,7 @@ export class Inspector {
     const options = [["-1", "Strongest of each pose"], ...character.poses.map((/** @type {any} */ pose, /** @type {number} */ k) => [String(k), `${pose.name}, bone by bone`])];
     this.poseSelect?.replaceChildren(...options.map(([value, text]) => element("option", { value }, text)));
     this.pose = -1;
-    const canvas = /** @type {HTMLCanvasElement} */ (this.map);
+    const canvas = this.map;
     canvas.style.height = `${ROW * character.bones.length + 22}px`;
   }
 
@@ -223,7 +223,7 @@ export class Inspector {
       });
       const centred = new History();
       centred.samples = this.landmarks.samples.map(({ at, values }) => ({ at, values: POINTS.map(({ index }, i) => values[index] - means[i]) }));
-      /** @type {HTMLElement} */ (this.landmarkTitle).textContent = "Landmarks, height";
+      this.landmarkTitle.textContent = "Landmarks, height";
       drawLines(this.landmarkPlot, centred, { now, least: -0.25, most: 0.25, indices: POINTS.map((_, i) => i), marks: ["¼ eye distance up", "down"] });
       legend(this.landmarkLegend, POINTS.map(({ name }) => name), []);
       return;
@@ -232,7 +232,7 @@ export class Inspector {
     const chosen = ["brow_inner_l", "brow_inner_r", "lip_upper_mid", "lip_lower_mid", "lip_corner_l", "lip_corner_r"].filter((name) => bones.includes(name));
     const names = chosen.length ? chosen : bones.slice(0, 6);
     const indices = names.map((/** @type {string} */ name) => bones.indexOf(name));
-    /** @type {HTMLElement} */ (this.landmarkTitle).textContent = "Bones, height";
+    this.landmarkTitle.textContent = "Bones, height";
     drawLines(this.landmarkPlot, this.bones, { now, least: -15, most: 15, indices, marks: ["15 mm up", "15 mm down"] });
     const values = this.bones.samples.at(-1)?.values ?? [];
     legend(this.landmarkLegend, names, indices.map((/** @type {number} */ i) => values[i]), (value) => `${value.toFixed(1)} mm`);
@@ -241,7 +241,7 @@ export class Inspector {
   /** @param {Float32Array} influence */
   #drawMap(influence) {
     const { poses, bones } = this.character;
-    const { context, width, height } = sharp(/** @type {HTMLCanvasElement} */ (this.map));
+    const { context, width, height } = sharp(this.map);
     context.clearRect(0, 0, width, height);
     context.font = "10.5px system-ui, sans-serif";
     context.textBaseline = "middle";

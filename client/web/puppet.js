@@ -78,7 +78,7 @@ export class Puppet {
   #slider(key, text) {
     const id = `slider-${key.replace(":", "-")}`;
     const output = element("output", { for: id }, "0");
-    const input = /** @type {HTMLInputElement} */ (element("input", { type: "range", min: "0", max: "1", step: "0.01", value: "0", id }));
+    const input = element("input", { type: "range", min: "0", max: "1", step: "0.01", value: "0", id });
     input.addEventListener("input", () => this.#moved(key, Number(input.value)));
     const row = element("div", { class: "slider" }, element("label", { for: id, title: text }, text), input, output);
     this.rows.set(key, { input, output, row });

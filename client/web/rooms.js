@@ -10,11 +10,12 @@ export class RoomPicker {
   constructor(choose) {
     this.choose = choose;
     this.current = "";
-    this.dialog = /** @type {HTMLDialogElement} */ (byId("rooms"));
+    /** @type {HTMLDialogElement} */
+    this.dialog = byId("rooms");
     this.timer = 0;
     this.shown = "";
     byId("room-button").addEventListener("click", () => this.open());
-    byId("room-form").addEventListener("submit", (event) => {
+    byId("room-form").addEventListener("submit", (/** @type {SubmitEvent} */ event) => {
       event.preventDefault();
       this.#go(byId("room-input").value.trim());
     });

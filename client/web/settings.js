@@ -44,7 +44,7 @@ export class Settings {
       element("h2", {}, "Strength"),
       ...GAINS.map(([name, text]) => this.#knob("gains", name, text, 3)),
       ...FLAGS.map(([name, text]) => {
-        const input = /** @type {HTMLInputElement} */ (element("input", { type: "checkbox", onchange: () => this.set(name, input.checked) }));
+        const input = element("input", { type: "checkbox", onchange: () => this.set(name, input.checked) });
         this.flags.set(name, input);
         return element("label", { class: "check" }, input, text);
       }),
@@ -54,7 +54,7 @@ export class Settings {
   /** @param {"smoothing" | "gains"} kind @param {string} name @param {string} text @param {number} most */
   #knob(kind, name, text, most) {
     const id = `knob-${kind}-${name}`;
-    const input = /** @type {HTMLInputElement} */ (element("input", { type: "range", min: "0", max: String(most), step: "0.05", id }));
+    const input = element("input", { type: "range", min: "0", max: String(most), step: "0.05", id });
     const output = element("output", { for: id });
     input.addEventListener("input", () => {
       this.values[kind] = { ...this.values[kind], [name]: Number(input.value) };

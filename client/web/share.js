@@ -10,7 +10,7 @@ export function showLinks(room) {
   byId("share-track").value = track;
   byId("share-obs").value = `${location.origin}/?room=${room}&bare=1&background=transparent`;
   byId("share-publish").value = socketUrl(`/v1/rooms/${room}/publish`);
-  drawQr(/** @type {any} */ (byId("share-qr")), track);
+  drawQr(byId("share-qr"), track);
   const isLoopback = ["localhost", "127.0.0.1", "[::1]"].includes(location.hostname);
   const problem = isLoopback
     ? "A phone cannot reach this address: open this page by the machine's own address or name first."

@@ -16,8 +16,10 @@ const NOBODY = 100;
 const MOST_PROFILE = 64 << 10;
 
 const isEmbedded = new URLSearchParams(location.search).get("embedded") === "1" && parent !== window;
-const video = /** @type {HTMLVideoElement} */ (/** @type {unknown} */ (byId("video")));
-const overlay = /** @type {HTMLCanvasElement} */ (/** @type {unknown} */ (byId("overlay")));
+/** @type {HTMLVideoElement} */
+const video = byId("video");
+/** @type {HTMLCanvasElement} */
+const overlay = byId("overlay");
 const points = new Float32Array(3 * NUM_POINTS);
 
 let room = roomOfAddress();

@@ -3,7 +3,7 @@
 /**
  * The element with this id; the page's own markup must hold it.
  * @param {string} id
- * @returns {HTMLElement & Record<string, any>}
+ * @returns {any} an element; what kind, the markup says
  */
 export function byId(id) {
   const found = document.getElementById(id);
@@ -16,9 +16,10 @@ export function byId(id) {
  * @param {string} tag
  * @param {Record<string, any>} [properties]
  * @param {...(Node | string)} children
- * @returns {HTMLElement & Record<string, any>}
+ * @returns {any} an element of the tag's kind
  */
 export function element(tag, properties = {}, ...children) {
+  /** @type {any} */
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
     if (name.startsWith("on")) made.addEventListener(name.slice(2), value);

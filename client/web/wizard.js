@@ -35,9 +35,13 @@ export class Wizard {
    */
   constructor(host) {
     this.host = host;
-    this.dialog = /** @type {HTMLDialogElement} */ (/** @type {unknown} */ (byId("wizard")));
+    /** @type {HTMLDialogElement} */
+    this.dialog = byId("wizard");
     this.run = 0;
     this.isOpen = false;
+    this.isRunning = false;
+    /** @type {AudioContext | undefined} */
+    this.sound = undefined;
     this.dialog.addEventListener("cancel", (event) => {
       event.preventDefault();
       this.cancel();
@@ -46,7 +50,7 @@ export class Wizard {
 
   /** The canvas for the person's own picture. */
   self() {
-    return /** @type {HTMLCanvasElement} */ (/** @type {unknown} */ (byId("wizard-self")));
+    return byId("wizard-self");
   }
 
   open() {
@@ -164,7 +168,7 @@ export class Wizard {
     /** @type {Map<string, HTMLInputElement>} */
     const boxes = new Map();
     const offered = Object.entries(offers).filter(([, isOffered]) => isOffered).map(([name]) => {
-      const box = /** @type {HTMLInputElement} */ (element("input", { type: "checkbox", checked: true }));
+      const box = element("input", { type: "checkbox", checked: true });
       boxes.set(name, box);
       return element("label", { class: "check" }, box, OFFERS[/** @type {keyof typeof OFFERS} */ (name)] ?? name);
     });
