@@ -10,6 +10,7 @@ mod config;
 pub mod feed;
 mod http;
 mod metrics;
+mod page;
 pub mod pipeline;
 mod publish;
 mod room;
