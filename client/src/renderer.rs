@@ -6,13 +6,16 @@ mod blood;
 mod camera;
 mod coefficients;
 mod deformation;
+mod device;
 mod environment;
 mod frame;
 mod fullscreen;
+#[cfg(not(target_arch = "wasm32"))]
 mod headless;
 mod layouts;
 mod pipelines;
 mod present;
+#[cfg(not(target_arch = "wasm32"))]
 mod read_back;
 mod regions;
 pub mod scattering;
@@ -29,9 +32,12 @@ mod zones;
 pub use camera::Camera;
 pub use coefficients::{bone_major, moves_bone, pose_table};
 pub use deformation::{Deformation, DeformationError};
+pub use device::{optional_features, required_limits};
 pub use frame::RenderFrame;
-pub use headless::{AdapterChoice, Headless, RenderError, optional_features, required_limits};
+#[cfg(not(target_arch = "wasm32"))]
+pub use headless::{AdapterChoice, Headless, RenderError};
 pub use pipelines::VERTEX_LAYOUT;
+#[cfg(not(target_arch = "wasm32"))]
 pub(crate) use read_back::read_back;
 pub use studio::{Studio, StudioError};
 pub use timing::{Pass, PassTimer};
@@ -82,6 +88,8 @@ pub struct DrawSettings {
     pub grain: f32,
     /// Edges are smoothed after the tone map.
     pub is_smoothed: bool,
+    /// No wall is drawn; the picture's alpha is how much of each pixel is covered, its colour is multiplied with that.
+    pub is_transparent: bool,
 }
 
 /// How skin takes light. Each is 1 for human skin unless it says otherwise.
@@ -122,6 +130,7 @@ impl DrawSettings {
             skin: SkinSettings::default(),
             grain: 0.0,
             is_smoothed: true,
+            is_transparent: false,
         }
     }
 }
@@ -354,7 +363,7 @@ impl Renderer {
             target_encodes_srgb: u32::from(self.presenter.target_encodes_srgb),
             is_split: u32::from(settings.view == ViewMode::Split),
             is_smoothed: u32::from(settings.is_smoothed && settings.view.is_lit()),
-            padding: 0,
+            is_transparent: u32::from(settings.is_transparent),
         };
         queue.write_buffer(&self.presenter.block, 0, bytemuck::bytes_of(&present));
     }
@@ -453,16 +462,21 @@ impl Renderer {
     ) {
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("scene"),
-            color_attachments: &[(&targets.specular_samples, &targets.specular), (&targets.diffuse_samples, &targets.diffuse)].map(
-                |(samples, resolved)| {
-                    Some(wgpu::RenderPassColorAttachment {
-                        view: samples,
-                        depth_slice: None,
-                        resolve_target: Some(resolved),
-                        ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color::BLACK), store: wgpu::StoreOp::Discard },
-                    })
-                },
-            ),
+            color_attachments: &[
+                (&targets.specular_samples, &targets.specular, 1.0),
+                (&targets.diffuse_samples, &targets.diffuse, background::FAR),
+            ]
+            .map(|(samples, resolved, a)| {
+                Some(wgpu::RenderPassColorAttachment {
+                    view: samples,
+                    depth_slice: None,
+                    resolve_target: Some(resolved),
+                    ops: wgpu::Operations {
+                        load: wgpu::LoadOp::Clear(wgpu::Color { r: 0.0, g: 0.0, b: 0.0, a }),
+                        store: wgpu::StoreOp::Discard,
+                    },
+                })
+            }),
             depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
                 view: &targets.depth,
                 depth_ops: Some(wgpu::Operations { load: wgpu::LoadOp::Clear(1.0), store: wgpu::StoreOp::Discard }),
@@ -474,9 +488,11 @@ impl Renderer {
         });
         let stand_off = pipelines::STRAND_STAND_OFF;
         pass.set_blend_constant(wgpu::Color { r: stand_off, g: stand_off, b: stand_off, a: stand_off });
-        pass.set_pipeline(&self.background);
-        pass.draw(0..3, 0..1);
-        self.num_draws += 1;
+        if !settings.is_transparent {
+            pass.set_pipeline(&self.background);
+            pass.draw(0..3, 0..1);
+            self.num_draws += 1;
+        }
         let blend = Look::blend_index(settings.blend);
         match settings.view {
             ViewMode::Beauty | ViewMode::Term(_) => self.draw_primitives(device, &mut pass, settings, Look::Wrinkled(blend)),

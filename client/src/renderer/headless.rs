@@ -1,5 +1,6 @@
 //! Pictures without a window.
 
+use super::device::{optional_features, required_limits};
 use super::read_back::read_back;
 use super::{DrawSettings, Pass, PassTimer, RenderFrame, Renderer};
 use crate::asset::CharacterAsset;
@@ -206,14 +207,4 @@ async fn open_device(choice: AdapterChoice) -> Result<(wgpu::AdapterInfo, wgpu::
         .await
         .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
     Ok((info, device, queue))
-}
-
-/// What the renderer uses where an adapter has it.
-pub fn optional_features(adapter: &wgpu::Adapter) -> wgpu::Features {
-    adapter.features() & wgpu::Features::TEXTURE_COMPRESSION_BC
-}
-
-/// What WebGL2 guarantees, with textures as large as the adapter has them.
-pub fn required_limits(adapter: &wgpu::Adapter) -> wgpu::Limits {
-    wgpu::Limits::downlevel_webgl2_defaults().using_resolution(adapter.limits())
 }

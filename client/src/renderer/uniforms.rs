@@ -211,10 +211,15 @@ pub struct Present {
     pub is_split: u32,
     /// 1: edges are smoothed.
     pub is_smoothed: u32,
-    /// Fills the block up.
-    pub padding: u32,
+    /// 1: alpha is coverage, else 1.
+    pub is_transparent: u32,
 }
-assert_layout!(Present, present, { target_encodes_srgb: TARGET_ENCODES_SRGB, is_split: IS_SPLIT, is_smoothed: IS_SMOOTHED });
+assert_layout!(Present, present, {
+    target_encodes_srgb: TARGET_ENCODES_SRGB,
+    is_split: IS_SPLIT,
+    is_smoothed: IS_SMOOTHED,
+    is_transparent: IS_TRANSPARENT,
+});
 
 /// The three rows of `target_from_source`.
 pub fn rows_of(transform: &Affine3A) -> [[f32; 4]; 3] {
