@@ -227,7 +227,7 @@ function showNumbers() {
   if (!stats) return;
   const isMoving = linkState === "open" && stats.bytesPerSecond > 0;
   byId("number-fps").textContent = stats.fps < 9.95 ? stats.fps.toFixed(1) : String(Math.round(stats.fps));
-  byId("number-latency").textContent = isMoving ? `${Math.round(stats.playoutDelayMs + stats.drawMs)} ms` : "–";
+  byId("number-latency").textContent = isMoving ? `${Math.round(stats.latencyMs + stats.drawMs)} ms` : "–";
   const bytes = isMoving ? stats.bytesPerSecond : 0;
   byId("number-bytes").textContent = bytes < 1000 ? `${Math.round(bytes)} B/s` : `${(bytes / 1000).toFixed(1)} kB/s`;
 }
@@ -408,8 +408,8 @@ async function start() {
   new Stage(canvas, started, (now) => {
     const frame = inspector.isOpen ? started.frame() : null;
     if (!frame) return;
-    const { playoutDelayMs, drawMs } = started.stats();
-    inspector.pictureShown(frame, playoutDelayMs + drawMs, now);
+    const { latencyMs, drawMs } = started.stats();
+    inspector.pictureShown(frame, latencyMs + drawMs, now);
   }, drawingFailed);
   chooseView(parameters.get("view") ?? "beauty");
   setInterval(showNumbers, NUMBERS);

@@ -136,7 +136,7 @@ export class Inspector {
     const influence = /** @type {Float32Array} */ (frame.influence);
     this.coefficients.push(now, Array.from(influence));
     this.zones.push(now, Array.from(frame.zones));
-    const bones = this.character.bones.map((/** @type {any} */ bone, /** @type {number} */ i) => 1000 * (frame.points[3 * i + 1] - bone.rest[1]));
+    const bones = this.character.bones.map((/** @type {any} */ bone, /** @type {number} */ i) => 1000 * (frame.bones[3 * i + 1] - bone.rest[1]));
     this.bones.push(now, bones);
     this.numBones = numBones;
   }

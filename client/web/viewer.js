@@ -5,11 +5,11 @@
  * @property {string} state waiting, live, lost, silent, idle or offline
  * @property {number} fps pictures a second
  * @property {number} bytesPerSecond payload of packets
- * @property {number} playoutDelayMs from a packet's arrival to the screen
+ * @property {number} latencyMs from a packet's arrival to the screen
  * @property {number} drawMs
  *
  * @typedef {object} ShownFrame
- * @property {Float32Array} points x, y, z of each bone's evaluated point, metres, head space
+ * @property {Float32Array} bones x, y, z of each bone's evaluated point, metres, head space
  * @property {Float32Array} influence pose by pose, a value in `[0, 1]` for each bone
  * @property {Float32Array} zones
  */
@@ -37,7 +37,7 @@ export class FaceViewer {
     } catch (error) {
       throw new Error(`the viewer cannot be loaded: ${error instanceof Error ? error.message : error}`);
     }
-    return new FaceViewer(await module.Viewer.start(canvas, backend, transparent));
+    return new FaceViewer(await module.Viewer.start(canvas, { backend, transparent }));
   }
 
   backend() {
@@ -46,7 +46,7 @@ export class FaceViewer {
 
   /** Takes a view socket's first message. @param {string} text */
   hello(text) {
-    this.client.hello(text, performance.now());
+    this.client.hello(text);
   }
 
   /** @param {Uint8Array} glb @param {string} sha256 */
@@ -64,7 +64,7 @@ export class FaceViewer {
   }
 
   linkLost() {
-    this.client.linkLost();
+    this.client.linkLost(performance.now());
   }
 
   /** Device pixels. @param {number} width @param {number} height */
@@ -110,10 +110,10 @@ export class FaceViewer {
 
   /** @returns {Stats} */
   stats() {
-    return this.client.stats(performance.now());
+    return this.client.stats();
   }
 
-  /** The newest frame; null before the first. @returns {ShownFrame | null} */
+  /** What the last picture shows; null before there is a character. @returns {ShownFrame | null} */
   frame() {
     return this.client.frame() ?? null;
   }
