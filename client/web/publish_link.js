@@ -14,6 +14,9 @@ const MOST_WAITING = 48 << 10;
 /** How long an own session that broke off may still hold the room, milliseconds: the server's idle time and a little. */
 const OWN_GHOST = 20_000;
 
+/** Milliseconds within which a connection must be answered. */
+const PATIENCE = 10_000;
+
 /** Publishes to one room. */
 export class PublishLink {
   /**
@@ -69,7 +72,9 @@ export class PublishLink {
       const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true } : {}) };
       socket.send(JSON.stringify(hello));
     };
+    const tooLate = setTimeout(() => socket.close(), PATIENCE);
     socket.onmessage = ({ data }) => {
+      clearTimeout(tooLate);
       if (this.socket !== socket || typeof data !== "string") return;
       let message;
       try {
@@ -97,6 +102,7 @@ export class PublishLink {
       this.listener.message?.(message);
     };
     socket.onclose = () => {
+      clearTimeout(tooLate);
       if (this.socket !== socket) return;
       this.socket = null;
       this.fail(last.message || "the connection was lost");

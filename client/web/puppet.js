@@ -1,5 +1,6 @@
 // The puppeteer's panel: sliders, expressions and poses, published like a tracker's frames.
 
+import { Clock } from "./clock.js";
 import { PublishLink, publishSentence } from "./publish_link.js";
 import { EXPRESSION_FACES, REGIONS, SHAPES, label, mirrored } from "./names.js";
 import { PuppetFace } from "./puppet_face.js";
@@ -30,7 +31,8 @@ export class Puppet {
     this.lastStep = 0;
     this.lastSent = 0;
     this.settling = 0;
-    this.timer = 0;
+    /** @type {Clock | null} */
+    this.clock = null;
     this.#build();
   }
 
@@ -143,13 +145,13 @@ export class Puppet {
     const hello = () => ({ source: "puppeteer", fps: 30, slot: "puppet", priority: 60 });
     this.link = new PublishLink(this.room, hello, { state: (state, detail) => this.#became(state, detail) });
     this.link.start({ takeover });
-    clearInterval(this.timer);
     this.lastStep = performance.now();
-    this.timer = setInterval(() => this.#tick(), 1000 / 60);
+    this.clock ??= new Clock(1000 / 60, () => this.#tick());
   }
 
   stop() {
-    clearInterval(this.timer);
+    this.clock?.stop();
+    this.clock = null;
     this.link?.stop();
     this.link = null;
   }

@@ -1,6 +1,7 @@
 // The camera page: tracks a face in the browser and publishes its points to a room.
 
 import { listCameras, openCamera } from "./camera.js";
+import { Clock } from "./clock.js";
 import { drawPoints, keyHeights } from "./overlay.js";
 import { PublishLink, publishSentence } from "./publish_link.js";
 import { Settings } from "./settings.js";
@@ -12,6 +13,8 @@ import { Wizard } from "./wizard.js";
 const NUM_POINTS = 478;
 /** Milliseconds between two frames that say nobody is in view. */
 const NOBODY = 100;
+/** Milliseconds between two looks at the video while the page is out of sight. */
+const HIDDEN = 30;
 /** A profile file larger than this is none. */
 const MOST_PROFILE = 64 << 10;
 
@@ -31,6 +34,11 @@ let stream = null;
 let run = 0;
 let lastT = 0;
 let lastNobody = 0;
+/** @type {Clock | null} */
+let clock = null;
+let lastVideoTime = -1;
+/** Keeps a phone's screen on. @type {WakeLockSentinel | null} */
+let wakeLock = null;
 let isMirrored = true;
 /** @type {any} */
 let profile = storage.read("profile");
@@ -115,6 +123,8 @@ async function start(deviceId = storage.read("camera") ?? "") {
     await showCameras();
     link.start();
     rate = { frames: 0, since: performance.now() };
+    clock = new Clock(HIDDEN, () => tick());
+    keepAwake();
     loop(mine);
   } catch (error) {
     if (mine === run) {
@@ -127,6 +137,10 @@ async function start(deviceId = storage.read("camera") ?? "") {
 function stop() {
   run += 1;
   link.stop();
+  clock?.stop();
+  clock = null;
+  wakeLock?.release().catch(() => {});
+  wakeLock = null;
   if (stream) end(stream);
   stream = null;
   video.srcObject = null;
@@ -180,12 +194,29 @@ async function loop(mine) {
  */
 function nextPicture() {
   return new Promise((resolve) => {
-    if ("requestVideoFrameCallback" in video) {
-      video.requestVideoFrameCallback((now, { captureTime }) => resolve(Math.min(now, captureTime ?? now)));
-    } else {
-      requestAnimationFrame((now) => resolve(now));
-    }
+    const request = video.requestVideoFrameCallback((now, { captureTime }) => {
+      tick = () => {};
+      resolve(Math.min(now, captureTime ?? now));
+    });
+    // Out of sight no picture is presented, but the video goes on.
+    tick = () => {
+      if (!document.hidden || video.currentTime === lastVideoTime) return;
+      tick = () => {};
+      lastVideoTime = video.currentTime;
+      video.cancelVideoFrameCallback(request);
+      resolve(performance.now());
+    };
   });
+}
+
+let tick = () => {};
+
+async function keepAwake() {
+  try {
+    wakeLock = await navigator.wakeLock.request("screen");
+  } catch {
+    // Not every browser has it, and none grants it on an empty battery.
+  }
 }
 
 /** @param {boolean} isSeen @param {number} captured */
@@ -366,6 +397,10 @@ function listen() {
   // A phone that is turned has a picture of another size: the server must know.
   video.addEventListener("resize", () => {
     if (link.state === "ready") link.start();
+  });
+  // The screen's lock is lost whenever the page is out of sight.
+  document.addEventListener("visibilitychange", () => {
+    if (!document.hidden && stream) keepAwake();
   });
   navigator.mediaDevices?.addEventListener?.("devicechange", () => {
     if (stream) showCameras();

@@ -12,6 +12,9 @@ import { Backoff, SUBPROTOCOL, socketUrl } from "./util.js";
 /** Codes of errors that another attempt does not cure. */
 const FINAL = new Set(["bad_room_name", "unknown_format", "forbidden_origin", "forbidden_host"]);
 
+/** Milliseconds within which a connection must bring its first message. */
+const PATIENCE = 10_000;
+
 /** Watches one room. */
 export class ViewLink {
   /**
@@ -45,7 +48,9 @@ export class ViewLink {
     const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/view`), SUBPROTOCOL);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
+    const tooLate = setTimeout(() => socket.close(), PATIENCE);
     socket.onmessage = ({ data }) => {
+      clearTimeout(tooLate);
       if (typeof data !== "string") {
         this.listener.packet(new Uint8Array(data));
         return;
@@ -62,6 +67,7 @@ export class ViewLink {
       }
     };
     socket.onclose = () => {
+      clearTimeout(tooLate);
       if (this.socket !== socket || this.isClosed) return;
       this.socket = null;
       if (isFinal) {

@@ -11,6 +11,8 @@ await run(async () => {
   const viewer = await open(watching, `/?room=${room}&bare=1`, { size: { width: 320, height: 320 } });
   await faceIsThere(viewer.page);
   const { page, errors } = await open(tracking, `/track.html?room=${room}`, { size: { width: 480, height: 800 } });
+  let sent = 0;
+  page.on("websocket", (socket) => socket.on("framesent", () => (sent += 1)));
   check("the page says that the video stays in the browser", (await text(page, ".private")).includes("never leaves this browser"));
   await page.click("#start");
   await until("a seen face", async () => {
@@ -35,6 +37,15 @@ await run(async () => {
     return data.filter((value, i) => i % 4 === 3 && value > 0).length;
   });
   check("the points are drawn over the picture", drawn > 400, `${drawn} pixels`);
+  // Out of sight no pictures are presented to a page; its camera goes on all the same.
+  await page.evaluate(() => {
+    Object.defineProperty(document, "hidden", { get: () => true });
+    HTMLVideoElement.prototype.requestVideoFrameCallback = () => 0;
+  });
+  await page.waitForTimeout(1000);
+  const before = sent;
+  await until("frames of a page that is out of sight", () => sent > before + 4);
+  check("a page that is out of sight goes on publishing", true);
   await page.click("#calibrate");
   await until("a calibrated face", async () => (await text(page, "#answer")).startsWith("Calibrated"));
   check("calibrate takes the neutral face", true);
