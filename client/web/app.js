@@ -397,11 +397,25 @@ async function start() {
   showViews();
   new Stage(canvas, started, (now) => {
     if (inspector.isOpen) inspector.pictureShown(started.frame(), started.stats().latencyMs, now);
-  });
+  }, deviceGone);
   chooseView(parameters.get("view") ?? "beauty");
   setInterval(showNumbers, NUMBERS);
   openLink();
   if (!isBare && storage.read("panel") !== false && innerWidth > 1100) panel.toggle(true);
+}
+
+/** How often a page starts anew by itself for a graphics device that goes away again and again. */
+const MOST_RESTARTS = 3;
+
+/** Says that nothing can be drawn any more, and starts the page anew. @param {unknown} error */
+function deviceGone(error) {
+  const count = Number(sessionStorage.getItem("restarts") ?? 0);
+  const goesOn = count < MOST_RESTARTS;
+  problem = `${sentence(error)}${goesOn ? " The page starts anew." : " Load the page again to try once more."}`;
+  showState();
+  if (!goesOn) return;
+  sessionStorage.setItem("restarts", String(count + 1));
+  setTimeout(() => location.reload(), 1500);
 }
 
 byId("panel-button").addEventListener("click", () => storage.write("panel", panel.isOpen));

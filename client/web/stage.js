@@ -33,8 +33,9 @@ export class Stage {
    * @param {HTMLCanvasElement} canvas
    * @param {Viewer} viewer
    * @param {(nowMs: number) => void} drawn called after a picture was drawn
+   * @param {(error: unknown) => void} failed called once nothing can be drawn any more: the graphics device is gone
    */
-  constructor(canvas, viewer, drawn) {
+  constructor(canvas, viewer, drawn, failed) {
     this.canvas = canvas;
     this.viewer = viewer;
     this.drawn = drawn;
@@ -43,9 +44,19 @@ export class Stage {
     this.#fit();
     new ResizeObserver(() => this.#fit()).observe(canvas);
     this.#listen();
+    let isOver = false;
+    const end = (/** @type {unknown} */ error) => {
+      if (!isOver) failed(error);
+      isOver = true;
+    };
+    canvas.addEventListener("webglcontextlost", () => end(new Error("The browser took the graphics device away.")));
     const tick = (/** @type {number} */ now) => {
-      requestAnimationFrame(tick);
-      if (this.viewer.draw(now)) this.drawn(now);
+      try {
+        if (!isOver && this.viewer.draw(now)) this.drawn(now);
+      } catch (error) {
+        end(error);
+      }
+      if (!isOver) requestAnimationFrame(tick);
     };
     requestAnimationFrame(tick);
   }
