@@ -14,7 +14,7 @@ use rhytid_shared::FaceFrame;
 use rhytid_shared::packet::{Decoder, PacketLayout};
 use rhytid_shared::view::{PROTOCOL_VERSION, ViewHello, ViewMessage};
 use sha2::{Digest, Sha256};
-use state::{FrameOut, Stats, number};
+use state::{Stats, frame_to_js};
 use std::time::Duration;
 use wasm_bindgen::prelude::*;
 
@@ -39,8 +39,8 @@ pub struct Viewer {
     num_garbage: u64,
     /// What the last picture took to record and submit, milliseconds.
     draw_ms: f64,
-    /// Sender's time of the newest frame, seconds.
-    newest_t: f64,
+    /// The page's clock when it was last heard of, milliseconds.
+    now_ms: f64,
     newest: Option<FaceFrame>,
     is_transparent: bool,
 }
@@ -48,6 +48,8 @@ pub struct Viewer {
 /// What hangs on the character.
 struct Scene {
     playout: Playout,
+    /// What the last picture shows.
+    shown: RenderFrame,
     settings: DrawSettings,
     sha256: String,
     /// Something but the face has changed since the last picture.
@@ -69,9 +71,12 @@ fn moment(now_ms: f64) -> Duration {
 
 #[wasm_bindgen]
 impl Viewer {
-    /// Opens `canvas` for drawing. `backend` is `auto`, `webgpu` or `webgl`; with `transparent` the page shows through where no
-    /// head is.
-    pub async fn start(canvas: web_sys::HtmlCanvasElement, backend: String, transparent: bool) -> Result<Viewer, JsError> {
+    /// Opens `canvas` for drawing. Of `options`, `backend` is `auto` (where it is missing), `webgpu` or `webgl`; with a true
+    /// `transparent` the page shows through where no head is.
+    pub async fn start(canvas: web_sys::HtmlCanvasElement, options: JsValue) -> Result<Viewer, JsError> {
+        let option = |name: &str| js_sys::Reflect::get(&options, &name.into()).ok().filter(|value| !value.is_undefined());
+        let backend = option("backend").and_then(|backend| backend.as_string()).unwrap_or_else(|| "auto".into());
+        let transparent = option("transparent").is_some_and(|transparent| transparent.is_truthy());
         let canvas = Canvas::open(canvas, &backend, transparent).await.map_err(error)?;
         Ok(Self {
             canvas,
@@ -84,7 +89,7 @@ impl Viewer {
             pictures: Rate::default(),
             num_garbage: 0,
             draw_ms: 0.0,
-            newest_t: 0.0,
+            now_ms: 0.0,
             newest: None,
             is_transparent: transparent,
         })
@@ -120,7 +125,7 @@ impl Viewer {
         settings.is_transparent = self.is_transparent;
         let playout = Playout::new(character);
         self.canvas.upload(&asset);
-        self.scene = Some(Scene { playout, settings, sha256, is_stale: true });
+        self.scene = Some(Scene { playout, shown: RenderFrame::at_rest(character), settings, sha256, is_stale: true });
         Ok(())
     }
 
@@ -134,7 +139,7 @@ impl Viewer {
     }
 
     /// Takes a view socket's first message.
-    pub fn hello(&mut self, text: &str, now_ms: f64) -> Result<(), JsError> {
+    pub fn hello(&mut self, text: &str) -> Result<(), JsError> {
         let Ok(ViewMessage::Hello(hello)) = serde_json::from_str(text) else {
             return Err(error("the server's first message is no hello"));
         };
@@ -146,7 +151,7 @@ impl Viewer {
         let frame = layout.frame_at_rest();
         self.decoder = Some((Decoder::new(layout), frame));
         if let Some(scene) = &mut self.scene {
-            scene.playout.reconnected(moment(now_ms));
+            scene.playout.reconnected(moment(self.now_ms));
         }
         self.hello = Some(hello);
         self.is_linked = true;
@@ -155,6 +160,7 @@ impl Viewer {
 
     /// Takes a packet. False where it makes no sense; nothing else is lost by that.
     pub fn packet(&mut self, bytes: &[u8], now_ms: f64) -> bool {
+        self.now_ms = now_ms;
         self.packets.add(now_ms, 1.0);
         self.bytes.add(now_ms, bytes.len() as f64);
         let Some((decoder, frame)) = &mut self.decoder else { return false };
@@ -162,7 +168,6 @@ impl Viewer {
             self.num_garbage += 1;
             return false;
         }
-        self.newest_t = frame.captured_at_micros as f64 / 1e6;
         if let Some(scene) = &mut self.scene {
             scene.playout.push(frame, moment(now_ms));
         }
@@ -185,14 +190,15 @@ impl Viewer {
 
     /// Draws the face at `now_ms`, on the same clock as packets' arrivals, where there is something new to show.
     pub fn draw(&mut self, now_ms: f64) -> Result<bool, JsError> {
+        self.now_ms = now_ms;
         let Some(scene) = &mut self.scene else { return Ok(false) };
         let now = moment(now_ms);
-        let frame = scene.playout.sample(now).clone();
+        scene.shown.clone_from(scene.playout.sample(now));
         if !scene.playout.is_moving() && !scene.is_stale {
             return Ok(false);
         }
         let before = js_sys::Date::now();
-        if !self.canvas.draw(&scene.settings, &frame).map_err(error)? {
+        if !self.canvas.draw(&scene.settings, &scene.shown).map_err(error)? {
             return Ok(false);
         }
         scene.is_stale = false;
@@ -266,7 +272,8 @@ impl Viewer {
     }
 
     /// How things stand: `state`, rates a second, times in milliseconds.
-    pub fn stats(&mut self, now_ms: f64) -> JsValue {
+    pub fn stats(&mut self) -> JsValue {
+        let now_ms = self.now_ms;
         let playout = self.scene.as_ref().map(|scene| (scene.playout.state(), scene.playout.stats()));
         let state = match playout.map(|(state, _)| state) {
             _ if !self.is_linked => "offline",
@@ -282,7 +289,8 @@ impl Viewer {
             fps: self.pictures.per_second(now_ms),
             packets: self.packets.per_second(now_ms),
             bytes: self.bytes.per_second(now_ms),
-            playout_delay_ms: stats.delay.as_secs_f64() * 1e3,
+            face: self.newest.as_ref().is_some_and(|frame| frame.face),
+            latency_ms: stats.delay.as_secs_f64() * 1e3,
             jitter_ms: stats.jitter.as_secs_f64() * 1e3,
             draw_ms: self.draw_ms,
             num_garbage: self.num_garbage as f64,
@@ -292,16 +300,11 @@ impl Viewer {
         .to_js()
     }
 
-    /// The newest frame that came, for plots: `t`, `seq`, `session`, `face`, and arrays `points`, `influence`, `zones`, `shapes`,
-    /// `head`. Nothing before the first.
+    /// What the last picture shows, for plots: `t`, `seq`, `session` and `face` of the newest frame that came, and arrays `bones`
+    /// (points, metres, head space), `influence` (pose-major), `zones`, `shapes` (empty where there are none) and `head` (rotation
+    /// x, y, z, w and position). `null` before there is a character.
     pub fn frame(&self) -> JsValue {
-        self.newest.as_ref().map_or(JsValue::NULL, |frame| FrameOut(frame).to_js())
-    }
-
-    /// Sender's time of the newest frame, seconds.
-    #[wasm_bindgen(js_name = newestT)]
-    pub fn newest_t(&self) -> JsValue {
-        number(self.newest_t)
+        self.scene.as_ref().map_or(JsValue::NULL, |scene| frame_to_js(&scene.shown, self.newest.as_ref()))
     }
 }
 

@@ -170,7 +170,7 @@ async function greeted(text) {
 
 /** The graphics device is gone: a fresh page gets another. Once a minute, or a broken driver would keep it reloading. */
 function drawingFailed(/** @type {unknown} */ error) {
-  problem = `${sentence(error)}. Reload the page.`;
+  problem = `${sentence(error).replace(/\.$/, "")}. Load the page again to try once more.`;
   showState();
   const last = Number(sessionStorage.getItem("rhytid.reloaded") ?? 0);
   if (Date.now() - last < 60_000) return;

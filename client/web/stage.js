@@ -13,7 +13,7 @@ export class Stage {
    * @param {HTMLCanvasElement} canvas
    * @param {import("./viewer.js").FaceViewer} viewer
    * @param {(nowMs: number) => void} drawn called after a picture was drawn
-   * @param {(error: unknown) => void} failed called once, when nothing can be drawn any more
+   * @param {(error: unknown) => void} failed called once nothing can be drawn any more: the graphics device is gone
    */
   constructor(canvas, viewer, drawn, failed) {
     this.canvas = canvas;
@@ -24,14 +24,19 @@ export class Stage {
     this.#fit();
     new ResizeObserver(() => this.#fit()).observe(canvas);
     this.#listen();
+    let isOver = false;
+    const end = (/** @type {unknown} */ error) => {
+      if (!isOver) failed(error);
+      isOver = true;
+    };
+    canvas.addEventListener("webglcontextlost", () => end(new Error("The browser took the graphics device away.")));
     const tick = (/** @type {number} */ now) => {
       try {
-        if (this.viewer.draw(now)) this.drawn(now);
+        if (!isOver && this.viewer.draw(now)) this.drawn(now);
       } catch (error) {
-        failed(error);
-        return;
+        end(error);
       }
-      requestAnimationFrame(tick);
+      if (!isOver) requestAnimationFrame(tick);
     };
     requestAnimationFrame(tick);
   }

@@ -1,7 +1,7 @@
 //! The canvas's GPU side: surface, device, renderer.
 
 use crate::asset::CharacterAsset;
-use crate::renderer::{DrawSettings, RenderFrame, Renderer, optional_features, required_limits};
+use crate::renderer::{DrawSettings, RenderFrame, Renderer, required_limits};
 use rhytid_shared::Character;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -57,7 +57,8 @@ impl Canvas {
         let (device, queue) = adapter
             .request_device(&wgpu::DeviceDescriptor {
                 label: Some("rhytid canvas"),
-                required_features: optional_features(&adapter),
+                // Compressing the masks would take a browser longer than all the rest together.
+                required_features: wgpu::Features::empty(),
                 required_limits: required_limits(&adapter),
                 ..Default::default()
             })

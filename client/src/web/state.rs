@@ -1,10 +1,11 @@
 //! Plain objects for the page's script.
 
+use crate::renderer::RenderFrame;
 use js_sys::{Float32Array, Object, Reflect};
 use rhytid_shared::FaceFrame;
 use wasm_bindgen::JsValue;
 
-pub(super) fn number(value: f64) -> JsValue {
+fn number(value: f64) -> JsValue {
     JsValue::from_f64(value)
 }
 
@@ -19,7 +20,9 @@ pub(super) struct Stats {
     pub fps: f64,
     pub packets: f64,
     pub bytes: f64,
-    pub playout_delay_ms: f64,
+    pub face: bool,
+    /// From a packet's arrival to the screen.
+    pub latency_ms: f64,
     pub jitter_ms: f64,
     pub draw_ms: f64,
     pub num_garbage: f64,
@@ -31,11 +34,12 @@ impl Stats {
     pub fn to_js(&self) -> JsValue {
         let object = Object::new();
         set(&object, "state", &self.state.into());
+        set(&object, "face", &self.face.into());
         for (name, value) in [
             ("fps", self.fps),
-            ("packetsPerSecond", self.packets),
+            ("packets", self.packets),
             ("bytesPerSecond", self.bytes),
-            ("playoutDelayMs", self.playout_delay_ms),
+            ("latencyMs", self.latency_ms),
             ("jitterMs", self.jitter_ms),
             ("drawMs", self.draw_ms),
             ("garbage", self.num_garbage),
@@ -48,25 +52,20 @@ impl Stats {
     }
 }
 
-/// A frame as arrays.
-pub(super) struct FrameOut<'a>(pub &'a FaceFrame);
-
-impl FrameOut<'_> {
-    pub fn to_js(&self) -> JsValue {
-        let frame = self.0;
-        let array = |values: &[f32]| JsValue::from(Float32Array::from(values));
-        let object = Object::new();
-        set(&object, "t", &number(frame.captured_at_micros as f64 / 1e6));
-        set(&object, "seq", &number(f64::from(frame.seq)));
-        set(&object, "session", &number(f64::from(frame.session)));
-        set(&object, "face", &frame.face.into());
-        let points: Vec<f32> = frame.points.iter().flat_map(|point| point.to_array()).collect();
-        set(&object, "points", &array(&points));
-        set(&object, "influence", &array(&frame.influences));
-        set(&object, "zones", &array(&frame.zones));
-        set(&object, "shapes", &array(frame.shapes.as_ref().map_or(&[], |shapes| &shapes[..])));
-        let head = [frame.head.rotation.to_array().to_vec(), frame.head.position.to_array().to_vec()].concat();
-        set(&object, "head", &array(&head));
-        object.into()
-    }
+/// A picture's face as arrays; `newest` is the frame that came last.
+pub(super) fn frame_to_js(shown: &RenderFrame, newest: Option<&FaceFrame>) -> JsValue {
+    let array = |values: &[f32]| JsValue::from(Float32Array::from(values));
+    let object = Object::new();
+    set(&object, "t", &number(newest.map_or(0.0, |frame| frame.captured_at_micros as f64 / 1e6)));
+    set(&object, "seq", &number(newest.map_or(0.0, |frame| f64::from(frame.seq))));
+    set(&object, "session", &number(newest.map_or(0.0, |frame| f64::from(frame.session))));
+    set(&object, "face", &newest.is_some_and(|frame| frame.face).into());
+    let points: Vec<f32> = shown.points.iter().flat_map(|point| point.to_array()).collect();
+    set(&object, "bones", &array(&points));
+    set(&object, "influence", &array(&shown.influences));
+    set(&object, "zones", &array(&shown.zones));
+    set(&object, "shapes", &array(shown.shapes.as_ref().map_or(&[], |shapes| &shapes[..])));
+    let head = [shown.head.rotation.to_array().to_vec(), shown.head.position.to_array().to_vec()].concat();
+    set(&object, "head", &array(&head));
+    object.into()
 }
