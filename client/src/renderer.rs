@@ -310,7 +310,9 @@ impl Renderer {
             at_rest = RenderFrame::at_rest(character);
             &at_rest
         };
-        let weights = settings.deform.weights_of(frame).filter(|_| self.has_shapes);
+        // The view of what shapes do shows what they do.
+        let deform = if settings.view == ViewMode::ShapeDeltas { Deformation::Shapes } else { settings.deform };
+        let weights = deform.weights_of(frame).filter(|_| self.has_shapes);
         let matrices = match weights {
             Some(_) => self.palette.model_from_unposed(character, frame),
             None => self.palette.model_from_rest(character, frame),
@@ -405,8 +407,8 @@ impl Renderer {
         .inverse();
         let mouth = Mouth::new(character, frame);
         let shown = |k: usize| match settings.view {
-            ViewMode::Influence(None) => 1.0,
-            ViewMode::Influence(Some(only)) if only == k => 1.0,
+            ViewMode::Influence(None) | ViewMode::Masks(None) => 1.0,
+            ViewMode::Influence(Some(only)) | ViewMode::Masks(Some(only)) if only == k => 1.0,
             _ => 0.0,
         };
         let eye = settings.camera.eye();
@@ -483,6 +485,9 @@ impl Renderer {
             ViewMode::Bare => self.draw_primitives(device, &mut pass, settings, Look::Bare),
             ViewMode::Influence(_) => self.draw_primitives(device, &mut pass, settings, Look::Influence),
             ViewMode::Normals => self.draw_primitives(device, &mut pass, settings, Look::Normals(blend)),
+            ViewMode::Masks(_) => self.draw_primitives(device, &mut pass, settings, Look::ZoneMasks),
+            ViewMode::BoneMasks => self.draw_primitives(device, &mut pass, settings, Look::BoneMasks),
+            ViewMode::ShapeDeltas => self.draw_primitives(device, &mut pass, settings, Look::Deltas),
             ViewMode::Wireframe => self.draw_wireframe(device, &mut pass),
             ViewMode::Split => {
                 let [width, height] = targets.size;
@@ -504,7 +509,11 @@ impl Renderer {
         let (has_bones, has_zones) = self.systems(settings);
         // A map that nothing shows is not read.
         let has_stretch = self.is_stretched;
-        let zones = (if has_zones { settings.zone_blend.number() } else { 0 }, has_stretch);
+        let zones = match look {
+            // Masks are there whatever is drawn with them.
+            Look::ZoneMasks => (1, false),
+            _ => (if has_zones { settings.zone_blend.number() } else { 0 }, has_stretch),
+        };
         // What adds to or covers the rest comes last.
         let rank = |surface: Surface| match surface {
             Surface::Hair => 1,

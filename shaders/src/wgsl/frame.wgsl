@@ -39,7 +39,7 @@ struct Frame {
     blood: vec4<f32>,
     // x: metres a pixel covers at a metre.
     picture: vec4<f32>,
-    // Influence view: 1 for each pose shown.
+    // Views of influences and masks: 1 for each pose or zone shown.
     shown_poses: array<vec4<f32>, 2>,
     // x: see the constants.
     shown: vec4<u32>,
