@@ -66,7 +66,7 @@ fn shade(in: Varyings, normal: vec3<f32>) -> Shaded {
         let hue = select(vec3<f32>(0.0, 0.75, 0.85), vec3<f32>(0.95, 0.10, 0.05), blood > 0.0);
         return display(mix(grey, hue * (0.4 + grey), clamp(abs(blood) / BLOOD_SHOWN, 0.0, 1.0)));
     }
-    return shaded(in.world, min(diffuse, vec3<f32>(BRIGHTEST)), min(specular * frame.skin.y, vec3<f32>(BRIGHTEST)), in_mouth);
+    return shaded(in.world, min(diffuse, vec3<f32>(BRIGHTEST)), min(specular * (frame.skin.y * finish.intensity), vec3<f32>(BRIGHTEST)), in_mouth);
 }
 
 @fragment
