@@ -228,6 +228,7 @@ fn materials(writer: &mut Writer, painted: &Painted) -> Vec<Value> {
                     },
                     "normalTexture": { "index": slopes, "scale": painted.skin_slopes.scale },
                     "occlusionTexture": { "index": surface },
+                    "extras": { "rhytid_intensity_in_blue": true },
                 }),
                 Material::Eye => json!({
                     "name": name,
