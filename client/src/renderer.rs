@@ -414,6 +414,7 @@ impl Renderer {
             _ => 0.0,
         };
         let eye = settings.camera.eye();
+        let (mirrored, mirrored_gain) = settings.studio.mirrored();
         uniforms::Frame {
             clip_from_world: settings.camera.clip_from_world(size[0] as f32 / size[1] as f32).to_cols_array_2d(),
             shadow_from_world: settings.studio.shadow_from_world(settings.key_turn, centre, radius).to_cols_array_2d(),
@@ -429,8 +430,8 @@ impl Renderer {
             gazes: gazes(character, frame),
             skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
             blood: [self.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],
-            picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, 0.0, 0.0, 0.0],
-            shown: [shown_term(settings.view), 0, 0, 0],
+            picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, mirrored_gain, 0.0, 0.0],
+            shown: [shown_term(settings.view), mirrored, 0, 0],
             shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
         }
     }

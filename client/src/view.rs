@@ -252,8 +252,9 @@ impl App {
             Ok(new.character)
         });
         let streamed = self.spectator.sample(now).clone();
-        let is_by_hand = switches.hand.is_on;
-        let by_hand = is_by_hand.then(|| self.hand_face.frame(character, &switches.hand));
+        let hand = switches.hand.clone();
+        let is_by_hand = hand.is_on;
+        let by_hand = is_by_hand.then(|| self.hand_face.frame(character, &hand));
         let frame = by_hand.as_ref().unwrap_or(&streamed);
         if is_by_hand && cfg!(not(feature = "embedded")) {
             switches.draw.deform = Deformation::Shapes;
@@ -294,7 +295,8 @@ impl App {
         if let Canvas::Ready(canvas) = canvas {
             gpu.draw(canvas, &scene, switches);
             self.pictures += 1;
-            is_moving |= gpu.is_panel_moving();
+            // What the sliders were moved to while this picture was laid out shows in the next one.
+            is_moving |= gpu.is_panel_moving() || switches.hand != hand;
         } else {
             is_moving = true;
         }

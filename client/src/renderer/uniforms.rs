@@ -52,11 +52,11 @@ pub struct Frame {
     pub skin: [f32; 4],
     /// x: largest change of haemoglobin the codes of the map of blood reach, optical density.
     pub blood: [f32; 4],
-    /// x: metres a pixel covers at a metre.
+    /// x: metres a pixel covers at a metre. y: how much brighter than its light the box is that wet mirrors show.
     pub picture: [f32; 4],
     /// 1 for each pose or zone that views of influences and masks show.
     pub shown_poses: [[f32; 4]; MAX_POSE_VECTORS],
-    /// x: 1 shows only what shines through, 2 only the blood.
+    /// x: 1 shows only what shines through, 2 only the blood. y: the light that wet mirrors show.
     pub shown: [u32; 4],
 }
 assert_layout!(Frame, frame, {

@@ -96,12 +96,20 @@ fn highlights(stage: &Stage) -> anyhow::Result<()> {
             [view.extend(sequence.next(0.05, 0.6)).to_array(), light.extend(0.0).to_array()]
         })
         .collect();
-    let read = function_probe(stage, "vec4<f32>(highlight(vec3<f32>(0.0, 0.0, 1.0), in.a.xyz, in.b.xyz, in.a.w, 0.028))", &cases)?;
+    let call =
+        "vec4<f32>(highlight(vec3<f32>(0.0, 0.0, 1.0), in.a.xyz, in.b.xyz, in.a.w, 0.028), masking(in.a.xyz, in.b.xyz, in.a.w), 0.0, 0.0)";
+    let read = function_probe(stage, call, &cases)?;
     let mut num_bright = 0;
     for ([a, b], got) in cases.iter().zip(read) {
         let (view, light) = (Vec4::from(*a), Vec4::from(*b));
         let twin = twin::skin::highlight(Vec3::Z, view.truncate(), light.truncate(), view.w, 0.028);
         ensure!((got[0] - twin).abs() < 1e-4 + 2e-3 * twin, "view {view}, light {light}: {} on the device, {twin} in the twin", got[0]);
+        let masking = twin::skin::masking(view.truncate(), light.truncate(), view.w);
+        ensure!(
+            (got[1] - masking).abs() < 1e-4,
+            "view {view}, light {light}: {} of it is left on the device, {masking} in the twin",
+            got[1]
+        );
         num_bright += usize::from(twin > 0.05);
     }
     ensure!(num_bright > 50, "only {num_bright} cases show a highlight");
