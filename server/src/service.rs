@@ -152,6 +152,11 @@ pub async fn run(
         config,
     });
     let app = router(hub.clone());
+    // In the background: whoever watches is answered at once, and the first publisher does not wait for what all share.
+    tokio::task::spawn_blocking({
+        let hub = Arc::downgrade(&hub);
+        move || hub.upgrade().iter().for_each(|hub| crate::solve::prepare(&hub.character, &hub.config.solve))
+    });
     tracing::info!(%address, character = hub.character.name, "serving");
     tokio::pin!(shutdown);
     let acceptor = identity.as_ref().map(Identity::acceptor);
