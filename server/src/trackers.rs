@@ -162,6 +162,9 @@ pub enum Refusal {
     /// Of no protocol that is spoken here.
     #[error("it is of no known protocol")]
     UnknownProtocol,
+    /// There are as many senders as a port has places for.
+    #[error("there are too many senders")]
+    TooManySenders,
     /// Belongs to no session.
     #[error("it belongs to no session")]
     NoSession,
@@ -181,6 +184,7 @@ impl Refusal {
             Self::OutOfRange => "out_of_range",
             Self::NoContent => "no_content",
             Self::UnknownProtocol => "unknown_protocol",
+            Self::TooManySenders => "too_many_performers",
             Self::NoSession => "no_session",
         }
     }

@@ -236,6 +236,33 @@ fn performers_get_rooms_called_as_they_are() {
     let mut phone = Phone::new(port(&server, 0));
     phone.next(0.1);
     server.wait_for_room("Tess", |room| room.is_some_and(|room| room["publisher"]["source"] == "livelink: Tess (127.0.0.1)"));
+    let start = Instant::now();
+    loop {
+        let (_, body) = server.get("/api/trackers", "");
+        let list: serde_json::Value = serde_json::from_slice(&body).unwrap();
+        let performer = &list["ports"][0]["performers"][0];
+        if !performer.is_null() {
+            assert_eq!(
+                (&performer["room"], &performer["session"], &list["ports"][0]["protocol"]),
+                (&"Tess".into(), &1.into(), &"livelink".into())
+            );
+            break;
+        }
+        assert!(start.elapsed() < Duration::from_secs(5), "the performer is listed");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+#[test]
+fn a_port_of_ipv6_answers_phones_of_both_kinds() {
+    let folder = tempfile::tempdir().unwrap();
+    let feed = weights_feed(&folder);
+    let Ok(probe) = UdpSocket::bind("[::]:0") else { return };
+    drop(probe);
+    let phone = Fake::start(FakeKind::Fmv3, feed, None);
+    let server = listening(&[&format!("fmv3=[::]:0,phone={},room=phone", phone.address)]);
+    let mut viewer = server.viewer("phone");
+    wait_until_it_moves(&mut viewer, 0.002);
 }
 
 #[test]

@@ -121,16 +121,21 @@ async fn run(hub: Arc<Hub>, index: usize, port: Port) {
                 }
             },
         }
-        send_all(&port.socket, &mut out);
+        send_all(&port, &mut out);
     }
     listener.say_goodbye(&mut out);
-    send_all(&port.socket, &mut out);
+    send_all(&port, &mut out);
 }
 
 /// Sends without waiting: what the kernel has no room for is asked for again anyway.
-fn send_all(socket: &UdpSocket, out: &mut Vec<(SocketAddr, Vec<u8>)>) {
+fn send_all(port: &Port, out: &mut Vec<(SocketAddr, Vec<u8>)>) {
     for (to, bytes) in out.drain(..) {
-        if let Err(error) = socket.try_send_to(&bytes, to) {
+        // A socket of IPv6 reaches IPv4 by its mapped addresses.
+        let to = match to.ip() {
+            IpAddr::V4(ip) if port.address.is_ipv6() => SocketAddr::new(ip.to_ipv6_mapped().into(), to.port()),
+            _ => to,
+        };
+        if let Err(error) = port.socket.try_send_to(&bytes, to) {
             tracing::debug!(%to, %error, "cannot send");
         }
     }
@@ -308,7 +313,7 @@ impl<'a> Listener<'a> {
             let oldest = self.senders.iter().min_by_key(|(_, sender)| sender.last_heard).map(|(key, sender)| (*key, sender.last_heard));
             match oldest {
                 Some((key, heard)) if now - heard >= GIVES_WAY => self.senders.remove(&key),
-                _ => return Err(Refusal::WrongCount),
+                _ => return Err(Refusal::TooManySenders),
             };
         }
         let sender = self.senders.entry(from).or_insert_with(|| Sender { vmc: None, fmv3: None, last_heard: now });
@@ -405,7 +410,7 @@ impl<'a> Listener<'a> {
                 self.performers.remove(&key);
                 Ok(())
             }
-            _ => Err("too_many_performers"),
+            _ => Err(Refusal::TooManySenders.label()),
         }
     }
 
