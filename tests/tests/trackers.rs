@@ -10,6 +10,7 @@ use glam::Quat;
 use harness::{Server, Viewer};
 use rhytid_server::trackers::{fmv3, ifacialmocap, livelink, openseeface, vmc, vts};
 use rhytid_server::{FakeKind, FakeOptions, ListenSpec, SendOptions, SendSource, fake, send};
+use rhytid_shared::trust::Trust;
 use rhytid_shared::{ArkitShape, NUM_ARKIT_SHAPES};
 use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
@@ -467,6 +468,7 @@ fn a_recording_of_live_link_face_is_a_feed() {
         repeats: false,
         takeover: false,
         timeout: Duration::from_secs(10),
+        trust: Trust::Public,
     };
     let sender = std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
