@@ -289,7 +289,11 @@ struct SceneParts<'a> {
 
 fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::RenderPipeline {
     let options = wgpu::PipelineCompilationOptions { constants: parts.constants, ..Default::default() };
-    let is_film = parts.mixing == Mixing::Film;
+    let target = Some(wgpu::ColorTargetState {
+        format: SCENE_FORMAT,
+        blend: parts.mixing.blend(),
+        write_mask: if parts.mixing == Mixing::Film { wgpu::ColorWrites::COLOR } else { wgpu::ColorWrites::ALL },
+    });
     device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
         label: Some(parts.label),
         layout: Some(parts.layout),
@@ -312,18 +316,8 @@ fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::Render
             module: parts.module,
             entry_point: Some(parts.fragment_entry),
             compilation_options: options,
-            targets: &[
-                Some(wgpu::ColorTargetState {
-                    format: SCENE_FORMAT,
-                    blend: parts.mixing.blend(),
-                    write_mask: if is_film { wgpu::ColorWrites::COLOR } else { wgpu::ColorWrites::ALL },
-                }),
-                Some(wgpu::ColorTargetState {
-                    format: SCENE_FORMAT,
-                    blend: if is_film { None } else { parts.mixing.blend() },
-                    write_mask: if is_film { wgpu::ColorWrites::empty() } else { wgpu::ColorWrites::ALL },
-                }),
-            ],
+            // One state for both, as WebGL2 has it; a film's diffuse light is black and adds nothing.
+            targets: &[target.clone(), target],
         }),
         multiview_mask: None,
         cache: None,
