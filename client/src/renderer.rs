@@ -13,7 +13,6 @@ mod fullscreen;
 #[cfg(not(target_arch = "wasm32"))]
 mod headless;
 mod layouts;
-#[cfg(not(target_arch = "wasm32"))]
 mod picture_texture;
 mod pipelines;
 mod present;

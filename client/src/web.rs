@@ -7,7 +7,7 @@ mod state;
 
 use crate::asset::CharacterAsset;
 use crate::playout::{Playout, PlayoutState};
-use crate::renderer::{Camera, Deformation, DrawSettings, Studio, ViewMode, WrinkleSystem};
+use crate::renderer::{Camera, Deformation, DrawSettings, RenderFrame, Studio, ViewMode, WrinkleSystem};
 use canvas::Canvas;
 use rate::Rate;
 use rhytid_shared::FaceFrame;
