@@ -1,6 +1,6 @@
 //! Whatever comes in, nothing panics.
 
-use crate::solve_fixture::{IMAGE, View, character, expression, hello, landmark_frame, landmarks, rotation, see, weight_frame};
+use crate::solve_fixture::{IMAGE, View, character, expression, hello, landmark_frame, landmarks, see, weight_frame};
 use crate::solver;
 use glam::Vec3;
 use proptest::prelude::*;

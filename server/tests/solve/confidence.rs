@@ -1,6 +1,6 @@
 //! Landmarks that the tracker does not believe.
 
-use crate::solve_fixture::{View, character, expression, hello, influence, landmark_frame, landmarks, rotation, see};
+use crate::solve_fixture::{View, character, expression, hello, influence, landmark_frame, landmarks, see};
 use crate::{hold, largest, solver};
 use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::layout::Layout;

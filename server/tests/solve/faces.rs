@@ -1,8 +1,6 @@
 //! What faces, weights and bones given directly come to.
 
-use crate::solve_fixture::{
-    IMAGE, View, character, expression, feed, hello, influence, landmark_frame, landmarks, rotation, see, weight_frame,
-};
+use crate::solve_fixture::{IMAGE, View, character, expression, feed, hello, influence, landmark_frame, landmarks, see, weight_frame};
 use crate::{hold, largest, solver};
 use glam::{Quat, Vec3};
 use rhytid_server::solve::{SolveConfig, SolveError, Solver};

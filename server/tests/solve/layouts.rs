@@ -1,6 +1,6 @@
 //! Layouts of landmarks.
 
-use crate::solve_fixture::{IMAGE, character, feed, hello, landmark_frame, landmarks, rotation};
+use crate::solve_fixture::{IMAGE, character, feed, hello, landmark_frame};
 use crate::solver;
 use glam::{Quat, Vec3};
 use rhytid_server::feed::{Feed, FeedItem};

@@ -11,12 +11,11 @@ mod refusals;
 mod solve_fixture;
 mod turns;
 
-use crate::solve_fixture::{View, character, hello, landmark_frame, see};
-use crate::{hold, largest, solver};
 use glam::Vec3;
 use rhytid_server::solve::{SolveConfig, Solver};
 use rhytid_shared::layout::Layout;
 use rhytid_shared::{Character, FaceFrame};
+use solve_fixture::{View, hello, landmark_frame, see};
 use std::sync::Arc;
 
 fn solver(character: &Arc<Character>, focal: Option<f32>) -> Solver {

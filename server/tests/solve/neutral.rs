@@ -1,6 +1,6 @@
 //! The neutral face: how it is found, asked for, kept and refused.
 
-use crate::solve_fixture::{View, character, expression, feed, hello, influence, landmarks, rotation, weight_frame};
+use crate::solve_fixture::{View, character, expression, feed, hello, influence, landmarks, weight_frame};
 use crate::{hold, largest, solver};
 use rhytid_server::pipeline::Pipeline;
 use rhytid_server::solve::{SolveConfig, Solver};

@@ -1,6 +1,6 @@
 //! What is refused, and that it leaves no trace.
 
-use crate::solve_fixture::{View, character, hello, landmark_frame, landmarks, rotation, see};
+use crate::solve_fixture::{View, character, hello, landmark_frame, landmarks, see};
 use crate::{hold, largest, solver};
 use glam::{Quat, Vec3};
 use rhytid_server::solve::{SolveConfig, SolveError, Solver};

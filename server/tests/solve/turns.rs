@@ -1,6 +1,6 @@
 //! A head that turns shows no wrinkles.
 
-use crate::solve_fixture::{View, character, expression, influence, landmark_frame, landmarks, rotation, see};
+use crate::solve_fixture::{View, character, expression, landmark_frame, landmarks, rotation, see};
 use crate::{hold, largest, solver};
 use glam::Quat;
 use rhytid_shared::FaceFrame;
