@@ -165,6 +165,9 @@ pub enum Refusal {
     /// There are as many senders as a port has places for.
     #[error("there are too many senders")]
     TooManySenders,
+    /// Not newer than what has come before.
+    #[error("it comes too late")]
+    Late,
     /// Belongs to no session.
     #[error("it belongs to no session")]
     NoSession,
@@ -185,6 +188,7 @@ impl Refusal {
             Self::NoContent => "no_content",
             Self::UnknownProtocol => "unknown_protocol",
             Self::TooManySenders => "too_many_performers",
+            Self::Late => "late",
             Self::NoSession => "no_session",
         }
     }

@@ -27,6 +27,8 @@ pub(crate) const MOST_PERFORMERS: usize = 16;
 const ROUND: Duration = Duration::from_millis(200);
 /// A room that could not be had is asked for again this often.
 const RETRY: Duration = Duration::from_secs(1);
+/// Sessions a second that begin on one port: each sets up a solve, which costs more than thousands of frames.
+const SESSIONS_PER_SECOND: u32 = 10;
 /// Whoever has been silent for this long gives way to a newcomer on the same port, as an app does that was started again.
 const GIVES_WAY: Duration = Duration::from_millis(750);
 /// A phone that has been silent for this long is asked again.
@@ -151,6 +153,7 @@ struct Listener<'a> {
     nonce: u64,
     senders: HashMap<SocketAddr, Sender>,
     performers: HashMap<Key, Performer>,
+    begins: Rate,
     hellos: fmv3::Hellos,
     last_heard: Option<Instant>,
     last_request: Option<Instant>,
@@ -179,6 +182,7 @@ struct Performer {
     last_heard: Instant,
     /// When the room may be asked for again.
     retry_at: Instant,
+    begun_at: Option<Instant>,
     num_sessions: u32,
     live: Option<Live>,
 }
@@ -210,6 +214,7 @@ impl<'a> Listener<'a> {
             nonce: std::collections::hash_map::RandomState::new().build_hasher().finish() | 1,
             senders: HashMap::new(),
             performers: HashMap::new(),
+            begins: Rate::new(SESSIONS_PER_SECOND, Instant::now()),
             hellos: fmv3::Hellos::default(),
             last_heard: None,
             last_request: None,
@@ -330,7 +335,7 @@ impl<'a> Listener<'a> {
             self.make_room(now)?;
             let room = match &self.spec.room {
                 RoomRule::Named(room) => room.clone(),
-                RoomRule::Subject => room_of(&seen.subject),
+                RoomRule::Subject => room_of(protocol, &seen.subject),
             };
             let performer = Performer {
                 source: hello(protocol, &seen, from.ip()).source,
@@ -339,6 +344,7 @@ impl<'a> Listener<'a> {
                 rate: Rate::new(self.hub.config.limits.frames_per_second, now),
                 last_heard: now,
                 retry_at: now,
+                begun_at: None,
                 num_sessions: 0,
                 live: None,
             };
@@ -420,6 +426,9 @@ impl<'a> Listener<'a> {
         if now < performer.retry_at {
             return Err("room_taken");
         }
+        if performer.begun_at.is_some_and(|begun| now - begun < RETRY) || !self.begins.take_if_free(now) {
+            return Err("too_many_sessions");
+        }
         let (room, num_sessions) = (performer.room.clone(), performer.num_sessions);
         for (other, silent) in &mut self.performers {
             if other != key && silent.room == room && now - silent.last_heard >= GIVES_WAY {
@@ -439,6 +448,7 @@ impl<'a> Listener<'a> {
                     Sight::Landmarks { image, .. } => Some(image),
                     _ => None,
                 };
+                performer.begun_at = Some(now);
                 performer.num_sessions = num_sessions.saturating_add(1);
                 performer.live = Some(Live { intake, evicted, framer: Framer::new(swaps), image });
                 Ok(())
