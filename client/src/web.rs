@@ -7,7 +7,7 @@ mod state;
 
 use crate::asset::CharacterAsset;
 use crate::playout::{Playout, PlayoutState};
-use crate::renderer::{Camera, Deformation, DrawSettings, Studio, ViewMode, WrinkleSystem};
+use crate::renderer::{Camera, Deformation, DrawSettings, RenderFrame, Studio, ViewMode, WrinkleSystem};
 use canvas::Canvas;
 use rate::Rate;
 use rhytid_shared::FaceFrame;
@@ -213,10 +213,10 @@ impl Viewer {
         self.change(|settings| settings.camera.orbit(-dx * scale, dy * scale));
     }
 
-    /// Brings the camera nearer (`factor` below 1) or farther.
+    /// Brings the camera nearer (`factor` above 1) or farther.
     pub fn zoom(&mut self, factor: f32) {
         if factor.is_finite() && factor > 0.0 {
-            self.change(|settings| settings.camera.zoom(factor));
+            self.change(|settings| settings.camera.zoom(1.0 / factor));
         }
     }
 
