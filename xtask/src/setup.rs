@@ -18,7 +18,7 @@ struct Need {
     without: &'static str,
 }
 
-const NEEDS: [Need; 7] = [
+const NEEDS: [Need; 8] = [
     Need {
         what: "a Vulkan driver",
         packages: &["libvulkan1", "mesa-vulkan-drivers"],
