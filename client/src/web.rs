@@ -7,7 +7,7 @@ mod state;
 
 use crate::asset::CharacterAsset;
 use crate::playout::{Playout, PlayoutState};
-use crate::renderer::{Camera, Deformation, DrawSettings, RenderFrame, Studio, ViewMode, WrinkleSystem};
+use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, RenderFrame, Studio, ViewMode, WrinkleSystem};
 use canvas::Canvas;
 use rate::Rate;
 use rhytid_shared::FaceFrame;
@@ -213,10 +213,10 @@ impl Viewer {
         self.change(|settings| settings.camera.orbit(-dx * scale, dy * scale));
     }
 
-    /// Brings the camera nearer (`factor` below 1) or farther.
+    /// Brings the camera nearer (`factor` above 1) or farther.
     pub fn zoom(&mut self, factor: f32) {
         if factor.is_finite() && factor > 0.0 {
-            self.change(|settings| settings.camera.zoom(factor));
+            self.change(|settings| settings.camera.zoom(1.0 / factor));
         }
     }
 
@@ -245,8 +245,8 @@ impl Viewer {
         Ok(())
     }
 
-    /// Sets `wrinkles` (own, bones, zones, both, off), `light` (portrait, sunset), `deform` (bones, shapes), or `smooth` (on,
-    /// off).
+    /// Sets `wrinkles` (own, bones, zones, both, off), `light` (portrait, sunset), `deform` (bones, shapes), `blend` (pd, simple,
+    /// printed), or `smooth` (on, off).
     #[wasm_bindgen(js_name = setSwitch)]
     pub fn set_switch(&mut self, name: &str, value: &str) -> Result<(), JsError> {
         match (name, value) {
@@ -263,9 +263,15 @@ impl Viewer {
                 let deform: Deformation = value.parse().map_err(error)?;
                 self.change(|settings| settings.deform = deform);
             }
+            ("blend", _) => {
+                let blend: BlendMode = value.parse().map_err(error)?;
+                self.change(|settings| settings.blend = blend);
+            }
             ("smooth", "on" | "off") => self.change(|settings| settings.is_smoothed = value == "on"),
             _ => {
-                return Err(error(format!("switch {name:?} with value {value:?} is unknown, expected wrinkles, light, deform or smooth")));
+                return Err(error(format!(
+                    "switch {name:?} with value {value:?} is unknown, expected wrinkles, light, deform, blend or smooth"
+                )));
             }
         }
         Ok(())

@@ -179,7 +179,10 @@ function drawingFailed(/** @type {unknown} */ error) {
 }
 
 /** @param {unknown} error */
-const sentence = (error) => (error instanceof Error ? error.message : String(error));
+function sentence(error) {
+  const text = error instanceof Error ? error.message : String(error);
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
 
 // How things stand, in words.
 

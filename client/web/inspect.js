@@ -233,7 +233,7 @@ export class Inspector {
     const names = chosen.length ? chosen : bones.slice(0, 6);
     const indices = names.map((/** @type {string} */ name) => bones.indexOf(name));
     this.landmarkTitle.textContent = "Bones, height";
-    drawLines(this.landmarkPlot, this.bones, { now, least: -15, most: 15, indices, marks: ["15 mm up", "15 mm down"] });
+    drawLines(this.landmarkPlot, this.bones, { now, least: -30, most: 30, indices, marks: ["30 mm up", "30 mm down"] });
     const values = this.bones.samples.at(-1)?.values ?? [];
     legend(this.landmarkLegend, names, indices.map((/** @type {number} */ i) => values[i]), (value) => `${value.toFixed(1)} mm`);
   }

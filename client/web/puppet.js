@@ -168,7 +168,9 @@ export class Puppet {
   #became(state, detail) {
     const { sentence, toggle } = this;
     if (!sentence || !toggle) return;
-    sentence.textContent = state === "off" ? "Move a slider to take the face." : publishSentence(state, this.room, detail);
+    if (state === "off") sentence.textContent = "Move a slider to take the face.";
+    else if (state === "ready") sentence.textContent = `You move the face of room ${this.room}. Stop lets it go.`;
+    else sentence.textContent = publishSentence(state, this.room, detail);
     toggle.textContent = state === "taken" ? "Take over" : this.isOn() ? "Stop" : "Start";
     toggle.classList.toggle("primary", !this.isOn());
     this.settling = SETTLING;

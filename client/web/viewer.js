@@ -33,9 +33,9 @@ export class FaceViewer {
     let module;
     try {
       module = await import("./rhytid_client.js");
-      await module.default();
+      await module.default({ module_or_path: new URL("./rhytid_client_bg.wasm", import.meta.url) });
     } catch (error) {
-      throw new Error(`the viewer cannot be loaded: ${error instanceof Error ? error.message : error}`);
+      throw new Error(`The viewer cannot be loaded: ${error instanceof Error ? error.message : error}`);
     }
     return new FaceViewer(await module.Viewer.start(canvas, { backend, transparent }));
   }
@@ -84,7 +84,7 @@ export class FaceViewer {
 
   /** @param {number} factor above 1 the face grows */
   zoom(factor) {
-    this.client.zoom(1 / factor);
+    this.client.zoom(factor);
   }
 
   resetCamera() {

@@ -46,7 +46,7 @@ await run(async () => {
     return right > 0.4 && right > 2 * left ? { left, right } : null;
   }, 40_000);
   check(`the left brow's slider moves the right half of the picture (${moved.right.toFixed(2)} against ${moved.left.toFixed(2)} grey levels)`, true);
-  check("the page says that it publishes", (await text(page, "#page-puppet .publish p")) === `Publishing to room ${room}.`);
+  check("the page says who moves the face", (await text(page, "#page-puppet .publish p")).startsWith(`You move the face of room ${room}`));
   await page.click("text=Reset");
   await until("the face back at rest", async () => difference(before, await picture(viewer.page), [0.5, 0, 0.9, 0.6]) < 0.2, 40_000);
   check("reset brings the face back", true);

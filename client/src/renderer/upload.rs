@@ -75,7 +75,7 @@ impl Uploader<'_> {
     /// cube. What is added is never read.
     fn as_array<'c>(&self, layers: &[&'c MipChain]) -> Vec<&'c MipChain> {
         let mut layers = layers.to_vec();
-        let is_taken_for_another = layers.len() == 1 || layers.len() % 6 == 0;
+        let is_taken_for_another = layers.len() == 1 || layers.len().is_multiple_of(6);
         if self.device.adapter_info().backend == wgpu::Backend::Gl && is_taken_for_another {
             layers.extend(layers.last().copied());
         }
