@@ -3,6 +3,8 @@
 //!
 //! What a machine lacks shows as ignored: `cargo xtask setup` fetches it, `cargo xtask web` builds the page.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
+
 #[path = "service/harness.rs"]
 #[allow(dead_code, reason = "the service's tests use the rest")]
 mod harness;
