@@ -18,7 +18,7 @@ struct Need {
     without: &'static str,
 }
 
-const NEEDS: [Need; 7] = [
+const NEEDS: [Need; 6] = [
     Need {
         what: "a Vulkan driver",
         packages: &["libvulkan1", "mesa-vulkan-drivers"],
@@ -54,12 +54,6 @@ const NEEDS: [Need; 7] = [
         packages: &["chromium"],
         is_here: has_chromium,
         without: "the page's tests show as ignored",
-    },
-    Need {
-        what: "wasm-opt, which makes the page's module smaller",
-        packages: &["binaryen"],
-        is_here: || is_on_path("wasm-opt"),
-        without: "the module loads a little slower",
     },
 ];
 
