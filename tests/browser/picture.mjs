@@ -8,6 +8,12 @@ import { check, launch, open, run } from "./lib.mjs";
 
 const job = JSON.parse(fs.readFileSync(process.env.RHYTID_JOB, "utf8"));
 
+/** WebGPU without a GPU. A canvas of it reaches the page only where the browser itself draws with the same software Vulkan. */
+const WEBGPU = [
+  "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--use-vulkan=swiftshader", "--use-angle=vulkan",
+  "--enable-features=Vulkan,VulkanFromANGLE", "--disable-vulkan-surface",
+];
+
 /** Runs in the page. */
 async function draw({ backend, size, hello, packets, draws }) {
   const times = {};
@@ -52,7 +58,7 @@ async function draw({ backend, size, hello, packets, draws }) {
 }
 
 await run(async () => {
-  const flags = job.backend === "webgpu" ? ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"] : [];
+  const flags = job.backend === "webgpu" ? WEBGPU : [];
   const browser = await launch(...flags);
   // A text of the same origin: no page that draws, too.
   const { page, errors } = await open(browser, "/healthz", { size: { width: job.size, height: job.size } });

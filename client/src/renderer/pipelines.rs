@@ -246,7 +246,8 @@ impl Key {
 enum Mixing {
     /// It is covered.
     None,
-    /// It stays, highlights are added to its own.
+    /// It stays, highlights are added to its own. WebGL2 blends all attachments alike: a film's light from below is 0, and all
+    /// alphas stay.
     Film,
     /// It is covered by the share that alpha says; strands in any order, they are alike. Its own alphas (depth, scattering) stay but for that share of
     /// [`STRAND_STAND_OFF`]: scattering neither blurs the strand nor takes its darkness into the skin.
@@ -264,7 +265,8 @@ impl Mixing {
             Self::None => None,
             Self::Film => {
                 let sum = of(BlendFactor::One, BlendFactor::One, BlendOperation::Add);
-                Some(wgpu::BlendState { color: sum, alpha: sum })
+                let kept = of(BlendFactor::Zero, BlendFactor::One, BlendOperation::Add);
+                Some(wgpu::BlendState { color: sum, alpha: kept })
             }
             Self::Strand => Some(wgpu::BlendState {
                 color: of(BlendFactor::SrcAlpha, BlendFactor::OneMinusSrcAlpha, BlendOperation::Add),
@@ -289,11 +291,7 @@ struct SceneParts<'a> {
 
 fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::RenderPipeline {
     let options = wgpu::PipelineCompilationOptions { constants: parts.constants, ..Default::default() };
-    let target = Some(wgpu::ColorTargetState {
-        format: SCENE_FORMAT,
-        blend: parts.mixing.blend(),
-        write_mask: if parts.mixing == Mixing::Film { wgpu::ColorWrites::COLOR } else { wgpu::ColorWrites::ALL },
-    });
+    let target = Some(wgpu::ColorTargetState { format: SCENE_FORMAT, blend: parts.mixing.blend(), write_mask: wgpu::ColorWrites::ALL });
     device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
         label: Some(parts.label),
         layout: Some(parts.layout),
@@ -316,7 +314,6 @@ fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::Render
             module: parts.module,
             entry_point: Some(parts.fragment_entry),
             compilation_options: options,
-            // One state for both, as WebGL2 has it; a film's diffuse light is black and adds nothing.
             targets: &[target.clone(), target],
         }),
         multiview_mask: None,
