@@ -18,7 +18,7 @@ struct Need {
     without: &'static str,
 }
 
-const NEEDS: [Need; 8] = [
+const NEEDS: [Need; 7] = [
     Need {
         what: "a Vulkan driver",
         packages: &["libvulkan1", "mesa-vulkan-drivers"],
@@ -60,12 +60,6 @@ const NEEDS: [Need; 8] = [
         packages: &["ffmpeg"],
         is_here: || is_on_path("ffmpeg"),
         without: "the tests of the page's camera show as ignored",
-    },
-    Need {
-        what: "wasm-opt, which makes the page's module smaller",
-        packages: &["binaryen"],
-        is_here: || is_on_path("wasm-opt"),
-        without: "the module loads a little slower",
     },
 ];
 

@@ -105,7 +105,7 @@ fn compile(root: &Path, target: &Path, toolchain: &Toolchain) -> Result<PathBuf>
 
 /// Writes JavaScript for the module and makes it smaller. Does nothing where the module is that of the last time.
 fn bind(module: &Path, bound: &Path) -> Result<()> {
-    let has_optimiser = tools::is_on_path("wasm-opt");
+    let has_optimiser = tools::has_optimiser();
     let stamp = format!("{:x?} {} {has_optimiser}", Sha256::digest(std::fs::read(module)?), env!("CARGO_PKG_VERSION"));
     let stamp_file = bound.join("made-from");
     if std::fs::read_to_string(&stamp_file).is_ok_and(|made_from| made_from == stamp) {
@@ -118,6 +118,7 @@ fn bind(module: &Path, bound: &Path) -> Result<()> {
         wasm_bindgen_cli_support::Bindgen::new()
             .input_path(module)
             .web(true)?
+            .omit_default_module_path(false)
             .typescript(false)
             .remove_name_section(true)
             .remove_producers_section(true)

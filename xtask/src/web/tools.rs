@@ -1,12 +1,10 @@
 //! Who compiles to WebAssembly here: rustup's target, or Debian's own toolchain with its standard library's source.
 
-use crate::setup;
+use crate::setup::{self, is_on_path};
 use anyhow::{Result, bail};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-
-pub use crate::setup::is_on_path;
 
 /// The target.
 pub const TARGET: &str = "wasm32-unknown-unknown";
@@ -88,6 +86,15 @@ impl fmt::Display for Toolchain {
             Self::Debian => "Debian's toolchain",
         })
     }
+}
+
+/// A wasm-opt that knows tables of references: what older ones (Debian 12 has 108) write of them no browser starts.
+pub fn has_optimiser() -> bool {
+    const OLDEST: u32 = 116;
+    let Ok(output) = Command::new("wasm-opt").arg("--version").output() else { return false };
+    let said = String::from_utf8_lossy(&output.stdout);
+    let version = said.split_whitespace().find_map(|word| word.parse::<u32>().ok());
+    version.is_some_and(|version| version >= OLDEST)
 }
 
 fn sysroot(rustc: &str) -> Option<PathBuf> {
