@@ -112,7 +112,8 @@ pub struct PictureArgs {
     /// Pixels, WIDTHxHEIGHT
     #[arg(long, default_value = "512x512", value_parser = parse_size)]
     pub size: [u32; 2],
-    /// beauty, bare, split, influence, influence:POSE, normals, wireframe, diffuse, specular, scattering, translucency or blood
+    /// beauty, bare, split, influence, influence:POSE, normals, wireframe, diffuse, specular, scattering, translucency, blood, masks, masks:ZONE, bone-masks
+    /// or shape-deltas
     #[arg(long, default_value = "beauty")]
     pub view: String,
     /// How wrinkle maps become normals: pd, simple or printed

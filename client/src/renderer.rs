@@ -13,6 +13,7 @@ mod fullscreen;
 #[cfg(not(target_arch = "wasm32"))]
 mod headless;
 mod layouts;
+mod picture_texture;
 mod pipelines;
 mod present;
 #[cfg(not(target_arch = "wasm32"))]
@@ -36,6 +37,8 @@ pub use device::{optional_features, required_limits};
 pub use frame::RenderFrame;
 #[cfg(not(target_arch = "wasm32"))]
 pub use headless::{AdapterChoice, Headless, RenderError};
+#[cfg(not(target_arch = "wasm32"))]
+pub use picture_texture::picture_texture;
 pub use pipelines::VERTEX_LAYOUT;
 #[cfg(not(target_arch = "wasm32"))]
 pub(crate) use read_back::read_back;
@@ -319,7 +322,9 @@ impl Renderer {
             at_rest = RenderFrame::at_rest(character);
             &at_rest
         };
-        let weights = settings.deform.weights_of(frame).filter(|_| self.has_shapes);
+        // The view of what shapes do shows what they do.
+        let deform = if settings.view == ViewMode::ShapeDeltas { Deformation::Shapes } else { settings.deform };
+        let weights = deform.weights_of(frame).filter(|_| self.has_shapes);
         let matrices = match weights {
             Some(_) => self.palette.model_from_unposed(character, frame),
             None => self.palette.model_from_rest(character, frame),
@@ -414,11 +419,12 @@ impl Renderer {
         .inverse();
         let mouth = Mouth::new(character, frame);
         let shown = |k: usize| match settings.view {
-            ViewMode::Influence(None) => 1.0,
-            ViewMode::Influence(Some(only)) if only == k => 1.0,
+            ViewMode::Influence(None) | ViewMode::Masks(None) => 1.0,
+            ViewMode::Influence(Some(only)) | ViewMode::Masks(Some(only)) if only == k => 1.0,
             _ => 0.0,
         };
         let eye = settings.camera.eye();
+        let (mirrored, mirrored_gain) = settings.studio.mirrored();
         uniforms::Frame {
             clip_from_world: settings.camera.clip_from_world(size[0] as f32 / size[1] as f32).to_cols_array_2d(),
             shadow_from_world: settings.studio.shadow_from_world(settings.key_turn, centre, radius).to_cols_array_2d(),
@@ -434,8 +440,8 @@ impl Renderer {
             gazes: gazes(character, frame),
             skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
             blood: [self.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],
-            picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, 0.0, 0.0, 0.0],
-            shown: [shown_term(settings.view), 0, 0, 0],
+            picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, mirrored_gain, 0.0, 0.0],
+            shown: [shown_term(settings.view), mirrored, 0, 0],
             shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
         }
     }
@@ -499,6 +505,9 @@ impl Renderer {
             ViewMode::Bare => self.draw_primitives(device, &mut pass, settings, Look::Bare),
             ViewMode::Influence(_) => self.draw_primitives(device, &mut pass, settings, Look::Influence),
             ViewMode::Normals => self.draw_primitives(device, &mut pass, settings, Look::Normals(blend)),
+            ViewMode::Masks(_) => self.draw_primitives(device, &mut pass, settings, Look::ZoneMasks),
+            ViewMode::BoneMasks => self.draw_primitives(device, &mut pass, settings, Look::BoneMasks),
+            ViewMode::ShapeDeltas => self.draw_primitives(device, &mut pass, settings, Look::Deltas),
             ViewMode::Wireframe => self.draw_wireframe(device, &mut pass),
             ViewMode::Split => {
                 let [width, height] = targets.size;
@@ -520,7 +529,11 @@ impl Renderer {
         let (has_bones, has_zones) = self.systems(settings);
         // A map that nothing shows is not read.
         let has_stretch = self.is_stretched;
-        let zones = (if has_zones { settings.zone_blend.number() } else { 0 }, has_stretch);
+        let zones = match look {
+            // Masks are there whatever is drawn with them.
+            Look::ZoneMasks => (1, false),
+            _ => (if has_zones { settings.zone_blend.number() } else { 0 }, has_stretch),
+        };
         // What adds to or covers the rest comes last.
         let rank = |surface: Surface| match surface {
             Surface::Hair => 1,

@@ -1,10 +1,14 @@
 //! What a user may set: the listening address, the character, every limit and every time-out.
 
 use crate::solve::SolveConfig;
+use crate::trackers::spec::{ListenSpec, VmcOutSpec};
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+
+/// Most ports for trackers, and most addresses that get VMC.
+const MOST_PORTS: usize = 64;
 
 /// Why a configuration was refused.
 #[derive(Debug, thiserror::Error)]
@@ -50,6 +54,10 @@ pub struct ServerConfig {
     pub listen: String,
     /// The character's `.glb`; the built-in one where there is none.
     pub character: Option<PathBuf>,
+    /// Ports that listen for trackers, each `PROTOCOL=ADDRESS:PORT[,option=value…]`.
+    pub listen_udp: Vec<ListenSpec>,
+    /// Where rooms' faces are sent as VMC, each `ADDRESS:PORT[,room=NAME]`.
+    pub vmc_out: Vec<VmcOutSpec>,
     /// How much of everything.
     pub limits: Limits,
     /// How long for everything.
@@ -67,6 +75,8 @@ impl Default for ServerConfig {
         Self {
             listen: "127.0.0.1:7878".into(),
             character: None,
+            listen_udp: Vec::new(),
+            vmc_out: Vec::new(),
             limits: Limits::default(),
             timeouts: Timeouts::default(),
             access: Access::default(),
@@ -212,6 +222,12 @@ impl ServerConfig {
                 expected: "1024 to 16777216",
             });
         }
+        for (field, got) in [("listen_udp", self.listen_udp.len()), ("vmc_out", self.vmc_out.len())] {
+            // Each is a socket and a task.
+            if got > MOST_PORTS {
+                return Err(ServerConfigError::Range { field, got: format!("a list of {got}"), expected: "at most 64" });
+            }
+        }
         let timeouts = &self.timeouts;
         for (field, got) in [
             ("timeouts.hello", timeouts.hello),
@@ -258,6 +274,7 @@ mod tests {
         assert!(says("[limits]\nroms = 3").contains("unknown field `roms`"), "{}", says("[limits]\nroms = 3"));
         assert!(says("[limits]\nrooms = 0").contains("limits.rooms is 0, expected 1 to"));
         assert!(says("[limits]\nmessage_bytes = 3").contains("limits.message_bytes is 3"));
+        assert!(says("listen_udp = [\"kinect=127.0.0.1:1\"]").contains("protocol is \"kinect\""));
         assert!(says("[timeouts]\nping = -1.0").contains("timeouts.ping is -1"));
         assert!(says("[timeouts]\nping = nan").contains("timeouts.ping is NaN"));
         let missing = ServerConfig::from_file(Path::new("no/such.toml")).unwrap_err().to_string();

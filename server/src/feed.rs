@@ -1,5 +1,6 @@
-//! Feed files: the publish messages of one session, one a line (`.jsonl`).
+//! Feed files: the publish messages of one session, one a line (`.jsonl`), or a recording of Live Link Face (`.csv`).
 
+use crate::trackers::livelink_csv::LiveLinkCsv;
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
 use std::fs::File;
@@ -38,8 +39,11 @@ pub enum FeedItem {
     Calibrate,
 }
 
+/// The lines of a feed file, whatever it is on the disk.
+pub type FeedLines = Box<dyn BufRead + Send>;
+
 /// A feed being read, line by line.
-pub struct Feed<R = BufReader<File>> {
+pub struct Feed<R = FeedLines> {
     /// The first line.
     pub hello: PublishHello,
     path: String,
@@ -147,10 +151,12 @@ impl<R: BufRead> Feed<R> {
     }
 }
 
-fn open(path: &Path) -> Result<(BufReader<File>, String), FeedError> {
+fn open(path: &Path) -> Result<(FeedLines, String), FeedError> {
     let shown = path.display().to_string();
     let file = File::open(path).map_err(|source| FeedError::Io { path: shown.clone(), source })?;
-    Ok((BufReader::with_capacity(1 << 16, file), shown))
+    let lines = BufReader::with_capacity(1 << 16, file);
+    let is_recording = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("csv"));
+    Ok((if is_recording { Box::new(BufReader::new(LiveLinkCsv::new(lines))) } else { Box::new(lines) }, shown))
 }
 
 const NO_HELLO: &str = "the first line must be {\"type\":\"hello\",\"version\":1,…}";

@@ -23,6 +23,7 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
         .route("/healthz", get(async || "ok\n"))
         .route("/metrics", get(metrics))
         .route("/api/rooms", get(rooms))
+        .route("/api/trackers", get(trackers))
         .route("/characters/{file}", get(character))
         .route("/v1/rooms/{room}/publish", get(publish_socket))
         .route("/v1/rooms/{room}/view", get(view_socket))
@@ -121,6 +122,10 @@ async fn metrics(State(hub): State<Arc<Hub>>, headers: HeaderMap) -> Response {
 
 async fn rooms(State(hub): State<Arc<Hub>>) -> Response {
     axum::Json(serde_json::json!({ "rooms": hub.rooms.list() })).into_response()
+}
+
+async fn trackers(State(hub): State<Arc<Hub>>) -> Response {
+    axum::Json(serde_json::json!({ "ports": hub.trackers.list() })).into_response()
 }
 
 async fn character(State(hub): State<Arc<Hub>>, Path(file): Path<String>, headers: HeaderMap) -> Response {

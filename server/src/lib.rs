@@ -9,6 +9,7 @@ mod clip;
 mod config;
 pub mod feed;
 mod http;
+mod intake;
 mod metrics;
 mod page;
 pub mod pipeline;
@@ -20,6 +21,7 @@ mod socket;
 pub mod solve;
 mod stream;
 mod tls;
+pub mod trackers;
 mod viewer;
 
 pub use clip::{Clip, ClipError, ClipReader};
@@ -27,3 +29,5 @@ pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts, Tls}
 pub use send::{SendError, SendOptions, SendReport, SendSource, send};
 pub use service::{ServerError, bind, load_character, run};
 pub use tls::{Identity, TlsError};
+pub use trackers::fake::{FakeError, FakeKind, FakeOptions, fake};
+pub use trackers::spec::{ListenSpec, RoomRule, SpecError, VmcOutSpec};

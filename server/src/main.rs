@@ -1,13 +1,15 @@
-//! The server's command line: `serve` and `send`.
+//! The server's command line: `serve`, `send` and `fake`.
 
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use rhytid_server::{
-    Access, Clip, Identity, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, Tls, bind, load_character, run, send,
+    Access, Clip, FakeKind, FakeOptions, Identity, Limits, ListenSpec, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, Tls,
+    VmcOutSpec, bind, fake, load_character, run, send,
 };
 use rhytid_shared::trust::Trust;
 use std::io::Write;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -34,6 +36,8 @@ enum Command {
     Serve(Box<ServeArgs>),
     /// Publish a feed file, or an animation clip of a character.
     Send(SendArgs),
+    /// Play another program's tracker from a feed file, to try its protocol without it.
+    Fake(FakeArgs),
 }
 
 #[derive(Args)]
@@ -47,6 +51,14 @@ struct ServeArgs {
     /// Settings; flags given besides win.
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
+    /// A port for other programs' trackers, PROTOCOL one of any, openseeface, livelink, ifacialmocap, fmv3, vmc and vts; options
+    /// room=NAME|subject, slot=NAME, priority=0..100, groups=brows+lids+gaze+mouth+head, allow=IP, phone=IP:PORT,
+    /// version=1|2|3|facemotion3d, swap_jaw=BOOL, swap_mouth=BOOL (repeat for several).
+    #[arg(long, value_name = "PROTOCOL=IP:PORT[,OPTION=VALUE…]")]
+    listen_udp: Vec<ListenSpec>,
+    /// A program that gets a room's face as VMC (repeat for several).
+    #[arg(long, value_name = "IP:PORT[,room=NAME]")]
+    vmc_out: Vec<VmcOutSpec>,
     #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
@@ -96,6 +108,35 @@ fn parse_trust(text: &str) -> Result<Trust, String> {
     if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
 }
 
+#[derive(Args)]
+struct FakeArgs {
+    /// The feed file: weights, or landmarks, from which weights are told where the protocol has weights.
+    #[arg(value_name = "FEED")]
+    feed: PathBuf,
+    /// Whom to play.
+    #[arg(long = "as", value_name = "SENDER")]
+    kind: FakeKind,
+    /// Where to send to; without, to whoever asks for it (ifacialmocap, facemotion3d, fmv3, vts).
+    #[arg(long, value_name = "IP:PORT")]
+    to: Option<SocketAddr>,
+    /// Where to send from and to be asked at; port 0 takes a free one.
+    #[arg(long, default_value = "0.0.0.0:0", value_name = "IP:PORT")]
+    bind: SocketAddr,
+    /// What the performer is called, where the protocol says it.
+    #[arg(long, default_value = "Fake", value_parser = parse_subject)]
+    subject: String,
+    /// Feed seconds a second, or `max`.
+    #[arg(long, default_value = "1.0", value_parser = parse_speed)]
+    speed: f64,
+    /// Play it again and again.
+    #[arg(long = "loop")]
+    repeats: bool,
+}
+
+fn parse_subject(text: &str) -> Result<String, String> {
+    if text.len() <= 256 { Ok(text.to_owned()) } else { Err("expected at most 256 bytes".into()) }
+}
+
 fn parse_speed(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         _ if text == "max" => Ok(f64::INFINITY),
@@ -120,6 +161,7 @@ async fn main() -> ExitCode {
     let result = match cli.command {
         Command::Serve(args) => serve(*args, matches.subcommand_matches("serve")).await,
         Command::Send(args) => send_feed(args).await,
+        Command::Fake(args) => fake_feed(args).await,
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -133,7 +175,7 @@ async fn main() -> ExitCode {
 /// Logs go to standard error; `RUST_LOG` overrules `-v`.
 fn start_log(cli: &Cli) {
     let level = match (cli.verbose, &cli.command) {
-        (0, Command::Send(_)) => "warn",
+        (0, Command::Send(_) | Command::Fake(_)) => "warn",
         (0, Command::Serve(_)) => "rhytid_server=info,warn",
         (1, _) => "rhytid_server=debug,info",
         _ => "debug",
@@ -173,6 +215,8 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "room-timeout": timeouts.room_idle,
     }
     config.character = args.character.or(config.character);
+    config.listen_udp.extend(args.listen_udp);
+    config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);
     config.access.origins.extend(args.access.origins);
     // Given by flags it is whole, whatever the file says.
@@ -277,5 +321,25 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
     let SendReport { frames, errors } = report?;
     ensure!(errors == 0, "sent {frames} frames, of all messages the server refused {errors}");
     eprintln!("sent {frames} frames, none refused");
+    Ok(())
+}
+
+async fn fake_feed(args: FakeArgs) -> anyhow::Result<()> {
+    let options = FakeOptions {
+        kind: args.kind,
+        feed: args.feed,
+        to: args.to,
+        bind: args.bind,
+        subject: args.subject,
+        speed: args.speed,
+        repeats: args.repeats,
+    };
+    let mut interrupt = Signals::new().context("cannot wait for signals")?;
+    let tell = |address: SocketAddr| match options.to {
+        Some(to) => eprintln!("sending from udp {address} to {to}"),
+        None => eprintln!("waiting on udp {address} to be asked"),
+    };
+    let frames = fake(&options, tell, async move { interrupt.wait().await }).await?;
+    eprintln!("sent {frames} frames");
     Ok(())
 }

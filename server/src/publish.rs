@@ -1,11 +1,11 @@
 //! One publisher: its messages are read, solved, encoded and put into its room, in the order they come.
 
 use crate::config::seconds;
-use crate::pipeline::Pipeline;
-use crate::room::{Evicted, Publishing, RoomError};
+use crate::intake::{Begun, Intake, IntakeError};
+use crate::room::RoomError;
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
-use crate::solve::{Calibration, DelayReport, SolveError};
+use crate::solve::DelayReport;
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
 use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
@@ -84,37 +84,20 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infa
             Err(_) => return Err(refusal("hello_timeout", format!("no hello within {} seconds", timeouts.hello))),
         },
     };
-    // Before the room is claimed: a hello that leads to nothing takes no room from anybody.
-    let kept = hello.keep_neutral.then(|| hub.rooms.neutral(room, &hello)).flatten();
-    let (mut pipeline, has_kept) = start(hub, &hello, kept).map_err(|error| refusal("bad_hello", format!("hello: {error}")))?;
-    let (place, evicted) = claim(hub, room, &hello)?;
-    pipeline.set_session(place.session);
-    tracing::info!(%room, session = place.session, source = hello.source, takeover = hello.takeover, has_kept, "publisher ready");
+    let Begun { intake, evicted, kept_neutral } = Intake::begin(hub, room, hello).map_err(refused)?;
     let heard = Heard::now();
-    let mut session = Session::new(hub, place, pipeline, reader, hello);
+    let mut session = Session::new(hub, intake, reader);
     let stop = tokio::select! {
         biased;
         () = stopped(&mut shutdown) => Ending::shutdown().into(),
         _ = evicted => taken_over(),
-        result = session.run(socket, &heard, has_kept) => match result { Err(stop) => stop },
+        result = session.run(socket, &heard, kept_neutral) => match result { Err(stop) => stop },
         () = heard.silence(seconds(timeouts.publisher_idle)) => {
             refusal("idle", format!("nothing heard for {} seconds", timeouts.publisher_idle))
         }
     };
-    // What has refined the neutral since it was told of.
-    session.keep_neutral();
-    tracing::info!(%room, session = session.place.session, frames = session.num_frames, "publisher gone");
+    session.intake.end();
     Err(stop)
-}
-
-/// The session's pipeline, and whether it starts from the `kept` neutral face.
-fn start(hub: &Hub, hello: &PublishHello, kept: Option<Calibration>) -> Result<(Pipeline, bool), SolveError> {
-    let (character, config) = (&hub.character, &hub.config.solve);
-    // A neutral of weights does not fit a sender that has a layout too: its landmarks have none yet.
-    if let Some(pipeline) = kept.and_then(|kept| Pipeline::with_calibration(character.clone(), config, hello, 0, kept).ok()) {
-        return Ok((pipeline, true));
-    }
-    Ok((Pipeline::new(character.clone(), config, hello, 0)?, false))
 }
 
 /// Reads up to the hello.
@@ -131,35 +114,27 @@ async fn read_hello(hub: &Hub, socket: &mut Socket, reader: &mut PublishReader) 
 /// A publisher that has claimed its room.
 struct Session<'a> {
     hub: &'a Hub,
-    place: Publishing,
-    pipeline: Pipeline,
+    intake: Intake,
     reader: PublishReader,
-    hello: PublishHello,
     frame: TrackingFrame,
-    packet: Vec<u8>,
     messages: Rate,
     calibrations: Rate,
     /// The sender knows that it is too fast.
     has_told_rate: bool,
-    num_frames: u64,
     num_bad_in_a_row: u32,
 }
 
 impl<'a> Session<'a> {
-    fn new(hub: &'a Hub, place: Publishing, pipeline: Pipeline, reader: PublishReader, hello: PublishHello) -> Self {
+    fn new(hub: &'a Hub, intake: Intake, reader: PublishReader) -> Self {
         let now = Instant::now();
         Self {
             hub,
-            place,
-            pipeline,
+            intake,
             reader,
-            hello,
             frame: TrackingFrame::default(),
-            packet: Vec::new(),
             messages: Rate::new(hub.config.limits.frames_per_second, now),
             calibrations: Rate::new(CALIBRATIONS_PER_SECOND, now),
             has_told_rate: false,
-            num_frames: 0,
             num_bad_in_a_row: 0,
         }
     }
@@ -169,8 +144,8 @@ impl<'a> Session<'a> {
         let character = &self.hub.character;
         let ready = Answer::Ready {
             version: PROTOCOL_VERSION,
-            room: self.place.room.name.as_str(),
-            session: self.place.session,
+            room: self.intake.place.room.name.as_str(),
+            session: self.intake.place.session,
             kept_neutral,
             character: &character.name,
             bones: character.bones.iter().map(|bone| bone.name.as_str()).collect(),
@@ -211,7 +186,7 @@ impl<'a> Session<'a> {
         match self.reader.read(text, &mut self.frame) {
             Ok(PublishMessage::Calibrate) => {
                 if self.calibrations.take_if_free(Instant::now()) {
-                    self.pipeline.calibrate();
+                    self.intake.pipeline.calibrate();
                 } else {
                     let message = format!("more than {CALIBRATIONS_PER_SECOND} calibrations a second: this one is left out");
                     return self.refuse(socket, ErrorMessage::new("too_many_calibrations", message)).await;
@@ -219,40 +194,29 @@ impl<'a> Session<'a> {
             }
             Ok(PublishMessage::Hello(_)) => unreachable!("the reader refuses a second hello"),
             Ok(PublishMessage::Frame) => {
-                let start = std::time::Instant::now();
-                if let Err(error) = self.pipeline.solve(&self.frame) {
-                    self.reader.take_back();
-                    return self.refuse(socket, ErrorMessage::new("bad_frame", error.to_string())).await;
+                match self.intake.frame(self.hub, &self.frame) {
+                    Ok(true) => {}
+                    Ok(false) => return Err(taken_over()),
+                    Err(error) => {
+                        self.reader.take_back();
+                        return self.refuse(socket, ErrorMessage::new("bad_frame", error.to_string())).await;
+                    }
                 }
-                self.hub.metrics.solve_seconds.observe(start.elapsed().as_secs_f64());
-                let kind = self.pipeline.encode(&mut self.packet);
-                if !self.place.publish(kind, &self.packet, self.pipeline.face()) {
-                    return Err(taken_over());
-                }
-                self.hub.metrics.frames_in.inc();
-                self.num_frames += 1;
                 self.num_bad_in_a_row = 0;
             }
             Err(error) => return self.refuse(socket, ErrorMessage::new(error.code, error.message)).await,
         }
-        if let Some(report) = self.pipeline.take_calibrated() {
-            self.keep_neutral();
+        if let Some(report) = self.intake.pipeline.take_calibrated() {
+            self.intake.keep_neutral();
             let answer = Answer::Calibrated {
                 t: report.t,
                 frames: report.num_frames,
                 requested: report.requested,
-                added_delay: self.pipeline.added_delay(),
+                added_delay: self.intake.pipeline.added_delay(),
             };
             send_json(socket, &answer, seconds(self.hub.config.timeouts.write)).await?;
         }
         Ok(())
-    }
-
-    /// Leaves the neutral in use with the room.
-    fn keep_neutral(&self) {
-        if let Some(calibration) = self.pipeline.calibration() {
-            self.place.keep_neutral(&self.hello, calibration);
-        }
     }
 
     /// Slows a sender that is too fast, whatever it sends: nothing is read meanwhile, so its own socket fills up. Its frames
@@ -274,7 +238,7 @@ impl<'a> Session<'a> {
     async fn refuse(&mut self, socket: &mut Socket, error: ErrorMessage) -> Result<(), Stop> {
         self.hub.metrics.drop_frames(error.code, 1);
         self.num_bad_in_a_row += 1;
-        tracing::debug!(room = %self.place.room.name, code = error.code, message = error.message, "bad message from publisher");
+        tracing::debug!(room = %self.intake.place.room.name, code = error.code, message = error.message, "bad message from publisher");
         send_json(socket, &error, seconds(self.hub.config.timeouts.write)).await?;
         let most = self.hub.config.limits.bad_frames_in_a_row;
         if self.num_bad_in_a_row >= most {
@@ -301,14 +265,14 @@ async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<Utf8Bytes, Stop> {
     }
 }
 
-fn claim(hub: &Hub, room: &RoomName, hello: &PublishHello) -> Result<(Publishing, Evicted), Stop> {
-    hub.rooms.claim(room, &hello.source, hello.takeover).map_err(|error| {
-        let code = match error {
-            RoomError::Taken => CloseCode::Policy,
-            RoomError::TooManyRooms { .. } | RoomError::TooManyViewers { .. } => CloseCode::Again,
-        };
-        Ending::error(code, ErrorMessage::new(error.code(), error.to_string())).into()
-    })
+fn refused(error: IntakeError) -> Stop {
+    let message = error.to_string();
+    let (close, code) = match error {
+        IntakeError::Hello(_) => (CloseCode::Policy, "bad_hello"),
+        IntakeError::Room(RoomError::Taken) => (CloseCode::Policy, RoomError::Taken.code()),
+        IntakeError::Room(error) => (CloseCode::Again, error.code()),
+    };
+    Ending::error(close, ErrorMessage::new(code, message)).into()
 }
 
 /// The end of a publisher that does not keep the rules.
@@ -345,7 +309,7 @@ impl Heard {
 }
 
 /// So many a second, with a burst of a tenth of a second or of two.
-struct Rate {
+pub(crate) struct Rate {
     interval: Duration,
     burst: Duration,
     /// When what came so far would have come at the allowed rate.
@@ -353,7 +317,7 @@ struct Rate {
 }
 
 impl Rate {
-    fn new(per_second: u32, now: Instant) -> Self {
+    pub fn new(per_second: u32, now: Instant) -> Self {
         let interval = Duration::from_secs(1) / per_second;
         let burst = (interval * 2).max(Duration::from_millis(100));
         Self { interval, burst, due: now.checked_sub(burst).unwrap_or(now) }
@@ -367,7 +331,7 @@ impl Rate {
     }
 
     /// Counts one where the rate allows it now.
-    fn take_if_free(&mut self, now: Instant) -> bool {
+    pub fn take_if_free(&mut self, now: Instant) -> bool {
         let is_free = self.due <= now;
         if is_free {
             self.take(now);

@@ -10,7 +10,7 @@ use rhytid_shared::trust::Trust;
 use rhytid_shared::view::SUBPROTOCOL;
 use serde::Deserialize;
 use std::future::Future;
-use std::io::{BufRead, BufReader, Cursor};
+use std::io::{BufRead, Cursor};
 use std::path::PathBuf;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -103,7 +103,7 @@ pub async fn send(options: &SendOptions, progress: &ProgressBar, stop: impl Futu
                 if let Ok(file) = std::fs::metadata(path) {
                     progress.set_length(file.len());
                 }
-                let feed: Feed<BufReader<std::fs::File>> = Feed::open_for_any_character(path)?;
+                let feed = Feed::open_for_any_character(path)?;
                 send_once(feed, options, progress, &mut report, stop.as_mut()).await?
             }
             SendSource::Text(text, name) => {

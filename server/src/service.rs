@@ -7,6 +7,8 @@ use crate::room::Rooms;
 use crate::socket::{ErrorMessage, say_and_close};
 use crate::stream::{TimedStream, Wire};
 use crate::tls::{self, Identity, TlsError};
+use crate::trackers::listen::{self, Port, Trackers};
+use crate::trackers::vmc_out::{self, VmcOut};
 use axum::extract::Request;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use rhytid_shared::packet::PacketLayout;
@@ -86,6 +88,7 @@ pub(crate) struct Hub {
     pub hello_character: CharacterHello,
     pub layout: PacketLayout,
     pub rooms: Rooms,
+    pub trackers: Trackers,
     pub metrics: Arc<Metrics>,
     pub listens_on_loopback: bool,
     /// True once the service ends.
@@ -132,6 +135,13 @@ pub async fn run(
 ) -> Result<(), ServerError> {
     config.validate()?;
     let address = listener.local_addr().map_err(|source| ServerError::Listen { address: config.listen.clone(), source })?;
+    let (mut ports, mut outs) = (Vec::new(), Vec::new());
+    for spec in &config.listen_udp {
+        ports.push(Port::bind(spec).await?);
+    }
+    for spec in &config.vmc_out {
+        outs.push(VmcOut::bind(spec).await?);
+    }
     let metrics = Arc::new(Metrics::new());
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
@@ -140,6 +150,7 @@ pub async fn run(
         hello_character: ViewHello::new("", &character, character_url.clone()).character,
         layout: PacketLayout::from(&*character),
         rooms: Rooms::new(config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
+        trackers: Trackers::default(),
         listens_on_loopback: address.ip().is_loopback(),
         character,
         glb: glb.into(),
@@ -152,7 +163,14 @@ pub async fn run(
         config,
     });
     let app = router(hub.clone());
+    // In the background: whoever watches is answered at once, and the first publisher does not wait for what all share.
+    tokio::task::spawn_blocking({
+        let hub = Arc::downgrade(&hub);
+        move || hub.upgrade().iter().for_each(|hub| crate::solve::prepare(&hub.character, &hub.config.solve))
+    });
     tracing::info!(%address, character = hub.character.name, "serving");
+    listen::start(&hub, ports);
+    vmc_out::start(&hub, outs);
     tokio::pin!(shutdown);
     let acceptor = identity.as_ref().map(Identity::acceptor);
     let mut reload = tokio::time::interval(tls::RELOAD_INTERVAL);

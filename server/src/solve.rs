@@ -88,6 +88,14 @@ pub struct DelayReport {
     pub head: f64,
 }
 
+/// Makes what the sessions of a character share, which takes tens of milliseconds: a service does so before its first session
+/// comes, else that one does. The same character (by its `Arc`) is prepared once.
+pub fn prepare(character: &Arc<Character>, config: &SolveConfig) {
+    if config.estimate_weights {
+        estimate::ExpressionMap::shared(character);
+    }
+}
+
 /// Turns one publisher's tracking frames into face frames.
 pub struct Solver {
     character: Arc<Character>,

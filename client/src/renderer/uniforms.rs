@@ -52,11 +52,11 @@ pub struct Frame {
     pub skin: [f32; 4],
     /// x: largest change of haemoglobin the codes of the map of blood reach, optical density.
     pub blood: [f32; 4],
-    /// x: metres a pixel covers at a metre.
+    /// x: metres a pixel covers at a metre. y: how much brighter than its light the box is that wet mirrors show.
     pub picture: [f32; 4],
-    /// 1 for each pose the influence view shows.
+    /// 1 for each pose or zone that views of influences and masks show.
     pub shown_poses: [[f32; 4]; MAX_POSE_VECTORS],
-    /// x: 1 shows only what shines through, 2 only the blood.
+    /// x: 1 shows only what shines through, 2 only the blood. y: the light that wet mirrors show.
     pub shown: [u32; 4],
 }
 assert_layout!(Frame, frame, {
@@ -156,10 +156,16 @@ pub struct Material {
     pub roughness: f32,
     /// How much of the occlusion map counts, 0 to 1.
     pub occlusion_strength: f32,
-    /// Fills the block up.
-    pub padding: u32,
+    /// 1: the map's blue is the strength of highlights.
+    pub has_intensity: f32,
 }
-assert_layout!(Material, material, { base_color: BASE_COLOR, normal_scale: NORMAL_SCALE, roughness: ROUGHNESS, occlusion_strength: OCCLUSION_STRENGTH });
+assert_layout!(Material, material, {
+    base_color: BASE_COLOR,
+    normal_scale: NORMAL_SCALE,
+    roughness: ROUGHNESS,
+    occlusion_strength: OCCLUSION_STRENGTH,
+    has_intensity: HAS_INTENSITY,
+});
 
 /// Group 0 of the scattering draws.
 #[repr(C)]

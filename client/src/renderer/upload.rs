@@ -290,7 +290,7 @@ impl Uploader<'_> {
             normal_scale: asset.normal_scale,
             roughness: asset.roughness,
             occlusion_strength: asset.occlusion_strength,
-            padding: 0,
+            has_intensity: f32::from(u8::from(asset.has_intensity)),
         };
         let label = |what: &str| format!("{name} {what}");
         let block = self.filled(&label("material"), bytemuck::bytes_of(&block), wgpu::BufferUsages::UNIFORM);
