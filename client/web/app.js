@@ -178,9 +178,13 @@ function drawingFailed(/** @type {unknown} */ error) {
   setTimeout(() => location.reload(), 1500);
 }
 
+/** Most characters of a complaint that are shown. */
+const MOST_SAID = 240;
+
 /** @param {unknown} error */
 function sentence(error) {
-  const text = error instanceof Error ? error.message : String(error);
+  const whole = error instanceof Error ? error.message : String(error);
+  const text = whole.length > MOST_SAID ? `${whole.slice(0, MOST_SAID)}…` : whole;
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
