@@ -10,8 +10,8 @@ const job = JSON.parse(fs.readFileSync(process.env.RHYTID_JOB, "utf8"));
 
 /** WebGPU without a GPU. A canvas of it reaches the page only where the browser itself draws with the same software Vulkan. */
 const WEBGPU = [
-  "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--use-vulkan=swiftshader", "--use-angle=vulkan",
-  "--enable-features=Vulkan,VulkanFromANGLE", "--disable-vulkan-surface",
+  "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader",
+  "--use-angle=vulkan",
 ];
 
 /** Runs in the page. */
