@@ -1,6 +1,7 @@
 // What every browser test needs: a browser, pages that tell of their errors, pictures that can be compared.
 //
-// Environment: RHYTID_URL the server, RHYTID_NODE_MODULES where playwright-core is, RHYTID_CHROMIUM the browser.
+// Environment: RHYTID_URL the server, RHYTID_NODE_MODULES where playwright-core is, RHYTID_CHROMIUM the browser,
+// RHYTID_CHROMIUM_FLAGS more flags for it, between spaces.
 
 import { createRequire } from "node:module";
 import path from "node:path";
@@ -26,7 +27,8 @@ const FLAGS = [
 /** A browser without a window. */
 export function launch(...flags) {
   const { chromium } = required("playwright-core");
-  return chromium.launch({ executablePath: process.env.RHYTID_CHROMIUM ?? "/usr/bin/chromium", args: [...FLAGS, ...flags] });
+  const more = (process.env.RHYTID_CHROMIUM_FLAGS ?? "").split(" ").filter(Boolean);
+  return chromium.launch({ executablePath: process.env.RHYTID_CHROMIUM ?? "/usr/bin/chromium", args: [...FLAGS, ...more, ...flags] });
 }
 
 let numFailed = 0;
