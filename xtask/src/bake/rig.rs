@@ -92,6 +92,7 @@ const fn moved(bone: SkinBone, x: f32, y: f32, z: f32) -> SkinBone {
 /// measuring a tracker's readings of renders against its readings of performers.
 const CORNER_GAIN: [f32; 3] = [1.6, 1.7, 1.3];
 const UPPER_LIP_GAIN: [f32; 3] = [1.2, 1.5, 1.0];
+const LOWER_LIP_GAIN: [f32; 3] = [1.1, 1.3, 1.0];
 
 /// The forehead's muscle draws the skin up to the hair line.
 const FRONTALIS: &[Pull] = &[pull(0.0, 20.0, 0.80, 34.0), pull(0.0, 38.0, 0.55, 34.0)];
@@ -110,9 +111,9 @@ const SKIN_BONES: [SkinBone; 16] = [
     stronger(upper_lip(bone("lip_upper", &[(52, 1.0)], &[(52, 0.7), (63, 0.3)], 0.025)), UPPER_LIP_GAIN),
     stronger(upper_lip(bone("lip_upper_outer", &[(53, 1.0)], &[(53, 0.7), (63, 0.15), (54, 0.15)], 0.025)), UPPER_LIP_GAIN),
     stronger(bone("lip_corner", &[(54, 1.0)], &[(54, 0.8), (64, 0.2)], 0.034), CORNER_GAIN),
-    lower_lip(bone("lip_lower_outer", &[(55, 1.0)], &[(55, 0.7), (65, 0.15), (54, 0.15)], 0.025)),
-    lower_lip(bone("lip_lower", &[(56, 1.0)], &[(56, 0.7), (65, 0.3)], 0.025)),
-    midline(lower_lip(bone("lip_lower_mid", &[(57, 1.0)], &[(57, 0.6), (66, 0.4)], 0.026))),
+    stronger(lower_lip(bone("lip_lower_outer", &[(55, 1.0)], &[(55, 0.7), (65, 0.15), (54, 0.15)], 0.025)), LOWER_LIP_GAIN),
+    stronger(lower_lip(bone("lip_lower", &[(56, 1.0)], &[(56, 0.7), (65, 0.3)], 0.025)), LOWER_LIP_GAIN),
+    stronger(midline(lower_lip(bone("lip_lower_mid", &[(57, 1.0)], &[(57, 0.7), (66, 0.3)], 0.026))), LOWER_LIP_GAIN),
     midline(SkinBone {
         turns_with_jaw: true,
         zone: Zone::LowerLip,
