@@ -43,19 +43,33 @@ const NEUTRAL_SHAPES: [(&str, f32); 11] = [
 /// over the nose.
 const MOUTH_CLOSE_SHARE: f32 = 0.35;
 
-/// MakeHuman's `tongueOut` moves nothing but the tongue, through the lower lip: mouth and jaw open for it.
-const WITH_TONGUE_OUT: [(&str, f32); 3] = [("jawOpen", 0.40), ("mouthLowerDownLeft", 0.25), ("mouthLowerDownRight", 0.25)];
+/// What goes along with a shape: `(shape, what is added, share)`. MakeHuman's `tongueOut` moves nothing but the tongue, through
+/// the lower lip: mouth and jaw open for it. Lips that are pressed together show less of their red.
+const COMPANIONS: [(&str, &str, f32); 7] = [
+    ("tongueOut", "jawOpen", 0.40),
+    ("tongueOut", "mouthLowerDownLeft", 0.25),
+    ("tongueOut", "mouthLowerDownRight", 0.25),
+    ("mouthPressLeft", "mouthRollUpper", 0.30),
+    ("mouthPressRight", "mouthRollUpper", 0.30),
+    ("mouthPressLeft", "mouthRollLower", 0.12),
+    ("mouthPressRight", "mouthRollLower", 0.12),
+];
 
-/// Shapes that MakeHuman makes more timidly than people make them, and by how much. Found by a tracker: what it reads of a
-/// picture at weight 1 against what it reads of people at their strongest.
-const STRONGER_SHAPES: [(&str, f32); 7] = [
+/// By how much a shape is made stronger or weaker than MakeHuman's. Found by a tracker: what it reads of a picture at weight
+/// 1 against what it reads of people at their strongest. A press is half a smile at MakeHuman's strength.
+const SHAPE_STRENGTHS: [(&str, f32); 12] = [
+    ("browInnerUp", 1.4),
+    ("browOuterUpLeft", 1.25),
+    ("browOuterUpRight", 1.25),
     ("browDownLeft", 1.7),
     ("browDownRight", 1.7),
+    ("mouthPressLeft", 0.55),
+    ("mouthPressRight", 0.55),
     ("mouthRollLower", 1.9),
-    ("mouthRollUpper", 1.5),
+    ("mouthRollUpper", 1.4),
     ("mouthShrugLower", 1.6),
-    ("mouthUpperUpLeft", 1.4),
-    ("mouthUpperUpRight", 1.4),
+    ("mouthUpperUpLeft", 1.6),
+    ("mouthUpperUpRight", 1.6),
 ];
 
 /// MakeHuman's lips are fuller than most: by how much the upper and the lower one are flattened towards the line between them,
@@ -109,14 +123,14 @@ impl Base {
             if let Some(&(_, weight)) = NEUTRAL_SHAPES.iter().find(|(shape, _)| *shape == name) {
                 deltas.iter().for_each(|&(v, delta)| positions[v as usize] += delta * weight);
             }
-            let stronger = STRONGER_SHAPES.iter().find(|(shape, _)| *shape == name).map_or(1.0, |&(_, share)| share);
+            let stronger = SHAPE_STRENGTHS.iter().find(|(shape, _)| *shape == name).map_or(1.0, |&(_, share)| share);
             let share = if name == "mouthClose" { MOUTH_CLOSE_SHARE } else { stronger };
             morphs.push(deltas.into_iter().map(|(v, delta)| (v, delta * METRES_PER_UNIT * share)).collect());
         }
 
-        for (name, share) in WITH_TONGUE_OUT {
-            let opening: Vec<(u32, Vec3)> = morphs[shape(name)].iter().map(|&(v, delta)| (v, delta * share)).collect();
-            morphs[shape("tongueOut")].extend(opening);
+        for (name, companion, share) in COMPANIONS {
+            let added: Vec<(u32, Vec3)> = morphs[shape(companion)].iter().map(|&(v, delta)| (v, delta * share)).collect();
+            morphs[shape(name)].extend(added);
         }
 
         let eyes = mean(&positions, &[obj.vertices_of("helper-l-eye"), obj.vertices_of("helper-r-eye")].concat());
