@@ -44,13 +44,16 @@ const NEUTRAL_SHAPES: [(&str, f32); 11] = [
 const MOUTH_CLOSE_SHARE: f32 = 0.35;
 
 /// What goes along with a shape: `(shape, what is added, share)`. MakeHuman's `tongueOut` moves nothing but the tongue, through
-/// the lower lip: mouth and jaw open for it. Lips that are pressed together show less of their red.
-const COMPANIONS: [(&str, &str, f32); 7] = [
+/// the lower lip: mouth and jaw open for it. Its smile lifts the lower lip through the upper one, and a jaw that opens would
+/// show nothing. Lips that are pressed together show less of their red.
+const COMPANIONS: [(&str, &str, f32); 9] = [
+    ("mouthSmileLeft", "mouthLowerDownLeft", 0.28),
+    ("mouthSmileRight", "mouthLowerDownRight", 0.28),
     ("tongueOut", "jawOpen", 0.40),
     ("tongueOut", "mouthLowerDownLeft", 0.25),
     ("tongueOut", "mouthLowerDownRight", 0.25),
-    ("mouthPressLeft", "mouthRollUpper", 0.30),
-    ("mouthPressRight", "mouthRollUpper", 0.30),
+    ("mouthPressLeft", "mouthRollUpper", 0.25),
+    ("mouthPressRight", "mouthRollUpper", 0.25),
     ("mouthPressLeft", "mouthRollLower", 0.12),
     ("mouthPressRight", "mouthRollLower", 0.12),
 ];
@@ -65,9 +68,9 @@ const SHAPE_STRENGTHS: [(&str, f32); 12] = [
     ("browDownRight", 1.7),
     ("mouthPressLeft", 0.55),
     ("mouthPressRight", 0.55),
-    ("mouthRollLower", 1.9),
+    ("mouthRollLower", 1.6),
     ("mouthRollUpper", 1.4),
-    ("mouthShrugLower", 1.6),
+    ("mouthShrugLower", 1.35),
     ("mouthUpperUpLeft", 1.6),
     ("mouthUpperUpRight", 1.6),
 ];
