@@ -83,10 +83,10 @@ impl WeightRig {
         for [squint, blink] in self.lid_shapes {
             weights[squint] *= 1.0 - weights[blink].clamp(0.0, 1.0);
         }
-        // Rolling in and shrugging lift the same lip: together no higher than one of them, or it would cover the upper one.
+        // Rolling in and shrugging lift the same lip: what both lift beyond one of them counts half, or it would cover the upper one.
         let lift: f32 = self.lip_lifts.iter().map(|&shape| weights[shape]).sum();
         if lift > 1.0 {
-            self.lip_lifts.iter().for_each(|&shape| weights[shape] /= lift);
+            self.lip_lifts.iter().for_each(|&shape| weights[shape] *= 0.5 + 0.5 / lift);
         }
         self.add_linear(&weights, motions);
         if let Some(correctives) = &self.correctives {
