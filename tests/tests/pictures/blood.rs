@@ -140,7 +140,7 @@ fn frown(stage: &Stage) -> anyhow::Result<()> {
 
 fn raised_brows(stage: &Stage) -> anyhow::Result<()> {
     let marks = &stage.asset.character.ibug68;
-    let reddens = reddening(stage, "stretch", StillSide::Both, &[marks[27] + Vec3::Y * 0.055])?[0];
+    let reddens = reddening(stage, "stretch", StillSide::Both, &[marks[27] + Vec3::Y * 0.045])?[0];
     ensure!(reddens < -2.5, "the forehead reddens by {reddens:.1} codes");
     Ok(())
 }
