@@ -25,6 +25,9 @@ const START: &str = "index.html";
 /// The page of the camera. Its tracker compiles JavaScript from text, which no other page may.
 const CAMERA: &str = "track.html";
 
+/// The page's icon.
+const ICON: &str = "icon.svg";
+
 /// The answer to a request for `path` where that names a file of the page; `/track` means `/track.html`.
 pub(crate) fn answer(method: &Method, path: &str, headers: &HeaderMap, access: &Access) -> Option<Response> {
     if !matches!(*method, Method::GET | Method::HEAD) {
@@ -32,6 +35,8 @@ pub(crate) fn answer(method: &Method, path: &str, headers: &HeaderMap, access: &
     }
     let file = match path.strip_prefix('/')? {
         "" => find(START),
+        // What browsers ask for beside a page that names no icon, such as the list of rooms.
+        "favicon.ico" => find(ICON),
         name => find(name).or_else(|| find(&format!("{name}.html"))),
     }?;
     Some(file.answer(headers, access))

@@ -29,10 +29,10 @@ const SIDE: u32 = 512;
 /// A channel that is off by more than this many codes counts as different: SwiftShader and llvmpipe round and place samples a
 /// little differently.
 const CODES: u8 = 10;
-/// Share of the pixels that may be different.
-const MOST_DIFFERENT: f64 = 0.01;
-/// Mean difference over all channels, codes.
-const MOST_MEAN: f64 = 0.6;
+/// Share of the pixels that may be different; 0.0007 has been seen, and 0.004 for a face without wrinkles.
+const MOST_DIFFERENT: f64 = 0.002;
+/// Mean difference over all channels, codes; 0.09 has been seen, and 0.23 for a face without wrinkles.
+const MOST_MEAN: f64 = 0.16;
 /// Most the module may take compressed, bytes.
 const MOST_COMPRESSED: u64 = 3_000_000;
 /// A first picture that takes longer than this is a fault and no busy machine. The aim is 2 s; how long it took is printed.
