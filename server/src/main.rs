@@ -52,7 +52,7 @@ struct ServeArgs {
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
     /// A port for other programs' trackers, PROTOCOL one of any, openseeface, livelink, ifacialmocap, fmv3, vmc and vts; options
-    /// room=NAME|subject, slot=NAME, priority=0..100, groups=brows+lids+gaze+mouth+head, allow=IP, phone=IP:PORT,
+    /// room=NAME|subject, allow=IP, phone=IP:PORT,
     /// version=1|2|3|facemotion3d, swap_jaw=BOOL, swap_mouth=BOOL (repeat for several).
     #[arg(long, value_name = "PROTOCOL=IP:PORT[,OPTION=VALUE…]")]
     listen_udp: Vec<ListenSpec>,

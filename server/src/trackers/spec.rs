@@ -10,8 +10,6 @@ use std::str::FromStr;
 
 /// Most phones' addresses that a port takes datagrams from.
 const MOST_ALLOWED: usize = 64;
-/// The groups of a face that a source may drive.
-const GROUPS: [&str; 5] = ["brows", "lids", "gaze", "mouth", "head"];
 
 /// Why an option was refused: one sentence.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -37,12 +35,6 @@ pub struct ListenSpec {
     pub address: SocketAddr,
     /// Which room.
     pub room: RoomRule,
-    /// The source slot, by default called as the protocol.
-    pub slot: Option<RoomName>,
-    /// Higher wins, 0 to 100.
-    pub priority: Option<u8>,
-    /// The groups of the face that it may drive; empty: all.
-    pub groups: Vec<&'static str>,
     /// Where datagrams may come from; empty: anywhere.
     pub allow: Vec<IpAddr>,
     /// The phone that is asked to send.
@@ -80,9 +72,6 @@ impl FromStr for ListenSpec {
             protocol,
             address: parse("address", address, "an IP address and a port")?,
             room: RoomRule::Named(room_name("demo")?),
-            slot: None,
-            priority: None,
-            groups: Vec::new(),
             allow: Vec::new(),
             phone: None,
             dialect: (protocol == Some(Protocol::IFacialMocap)).then_some(Dialect::V2),
@@ -111,22 +100,6 @@ impl ListenSpec {
         match key {
             "room" if value == "subject" => self.room = RoomRule::Subject,
             "room" => self.room = RoomRule::Named(room_name(value)?),
-            "slot" => self.slot = Some(room_name(value)?),
-            "priority" => {
-                let priority = parse("option priority", value, "0 to 100")?;
-                if priority > 100 {
-                    return Err(SpecError(format!("option priority is {priority}, expected 0 to 100")));
-                }
-                self.priority = Some(priority);
-            }
-            "groups" => {
-                for group in value.split('+') {
-                    let known = GROUPS.into_iter().find(|known| *known == group);
-                    self.groups.push(known.ok_or_else(|| {
-                        SpecError(format!("option groups has {:?}, expected some of {} with + between them", cut(group), GROUPS.join(", ")))
-                    })?);
-                }
-            }
             "allow" => {
                 if self.allow.len() == MOST_ALLOWED {
                     return Err(SpecError(format!("more than {MOST_ALLOWED} options allow")));
@@ -147,7 +120,7 @@ impl ListenSpec {
             "swap_mouth" => self.swap_mouth = Some(parse("option swap_mouth", value, "true or false")?),
             _ => {
                 return Err(SpecError(format!(
-                    "option {:?} is not known to {}, expected room, slot, priority, groups, allow, phone, version, swap_jaw or swap_mouth",
+                    "option {:?} is not known to {}, expected room, allow, phone, version, swap_jaw or swap_mouth",
                     cut(key),
                     self.protocol_name()
                 )));
@@ -235,11 +208,8 @@ mod tests {
     fn options_are_read() {
         let spec: ListenSpec = "openseeface=127.0.0.1:11573,room=demo".parse().unwrap();
         assert_eq!((spec.protocol, spec.address.port(), spec.allow.len()), (Some(Protocol::OpenSeeFace), 11573, 0));
-        let spec: ListenSpec =
-            "ifacialmocap=0.0.0.0:49983,phone=192.0.2.7:49983,room=subject,slot=phone,priority=70,groups=mouth+head,version=3,swap_jaw=true"
-                .parse()
-                .unwrap();
-        assert_eq!((spec.room.clone(), spec.priority, spec.groups.clone()), (RoomRule::Subject, Some(70), vec!["mouth", "head"]));
+        let spec: ListenSpec = "ifacialmocap=0.0.0.0:49983,phone=192.0.2.7:49983,room=subject,version=3,swap_jaw=true".parse().unwrap();
+        assert_eq!(spec.room, RoomRule::Subject);
         assert_eq!(spec.allow, ["192.0.2.7".parse::<IpAddr>().unwrap()], "only the phone that is asked may answer");
         assert!(spec.asks_fmv3() && spec.swap_jaw == Some(true) && spec.swap_mouth.is_none());
         assert_eq!("any=[::1]:9".parse::<ListenSpec>().unwrap().protocol, None);
@@ -254,8 +224,6 @@ mod tests {
             ("kinect=127.0.0.1:1", "protocol is \"kinect\", expected any, openseeface, livelink"),
             ("livelink=localhost", "address is \"localhost\", expected an IP address and a port"),
             ("livelink=127.0.0.1:1,room=a b", "room name \"a b\" is not"),
-            ("livelink=127.0.0.1:1,priority=101", "option priority is 101"),
-            ("livelink=127.0.0.1:1,groups=ears", "option groups has \"ears\""),
             ("livelink=127.0.0.1:1,phone=127.0.0.1:1", "option phone is for"),
             ("livelink=127.0.0.1:1,version=3", "option \"version\" is not known to livelink"),
             ("livelink=127.0.0.1:1,x", "\"x\" is no option=value"),
