@@ -84,7 +84,7 @@ impl<R: BufRead> Feed<R> {
         if feed.next_line()? {
             match feed.read(&mut TrackingFrame::default())? {
                 PublishMessage::Hello(first) => hello = first,
-                PublishMessage::Frame | PublishMessage::Calibrate => return Err(feed.refuse(MessageError::new("no_hello", NO_HELLO))),
+                _ => return Err(feed.refuse(MessageError::new("no_hello", NO_HELLO))),
             }
         } else {
             feed.line = 1;
@@ -101,6 +101,9 @@ impl<R: BufRead> Feed<R> {
         match self.read(frame)? {
             PublishMessage::Frame => Ok(Some(FeedItem::Frame)),
             PublishMessage::Calibrate => Ok(Some(FeedItem::Calibrate)),
+            PublishMessage::Settings(_) | PublishMessage::Recentre => {
+                Err(self.refuse(MessageError::new("unknown_type", "a feed has frames and \"calibrate\" only; settings go into its hello")))
+            }
             PublishMessage::Hello(_) => Err(self.refuse(MessageError::new("repeated_hello", "a feed has one hello, its first line"))),
         }
     }

@@ -95,6 +95,9 @@ struct SendArgs {
     /// Take the room over from another publisher.
     #[arg(long)]
     takeover: bool,
+    /// Send frames of landmarks in the binary form, a twelfth of the bytes.
+    #[arg(long)]
+    binary: bool,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     #[arg(long, default_value = "15", value_name = "SECONDS", value_parser = parse_seconds)]
     timeout: Duration,
@@ -312,6 +315,7 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         speed: args.speed,
         repeats: args.repeats,
         takeover: args.takeover,
+        binary: args.binary,
         timeout: args.timeout,
         trust: args.trust,
     };

@@ -5,9 +5,9 @@ use crate::feed::{Feed, FeedError, FeedItem};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use indicatif::ProgressBar;
-use rhytid_shared::TrackingFrame;
 use rhytid_shared::trust::Trust;
 use rhytid_shared::view::SUBPROTOCOL;
+use rhytid_shared::{TrackingData, TrackingFrame, encode_landmarks};
 use serde::Deserialize;
 use std::future::Future;
 use std::io::{BufRead, Cursor};
@@ -77,6 +77,8 @@ pub struct SendOptions {
     pub repeats: bool,
     /// Take the room over from another publisher.
     pub takeover: bool,
+    /// Send frames of landmarks in the binary form, a twelfth of the bytes; what it has no room for stays JSON.
+    pub binary: bool,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     pub timeout: Duration,
     /// Whom to trust where `to` is `wss://`.
@@ -246,12 +248,12 @@ async fn publish<R: BufRead>(
     report: &mut SendReport,
 ) -> Result<(), Unsent> {
     let within = |what: &str| Unsent::Stuck(format!("{what} within {} s", options.timeout.as_secs_f64()));
-    let mut write = async |text: String| match tokio::time::timeout(options.timeout, sink.send(Message::text(text))).await {
+    let mut write = async |message: Message| match tokio::time::timeout(options.timeout, sink.send(message)).await {
         Ok(Ok(())) => Ok(()),
         Ok(Err(_)) => Err(Unsent::Lost),
         Err(_) => Err(within("it read nothing")),
     };
-    write(hello(feed.text(), options.takeover)).await?;
+    write(Message::text(hello(feed.text(), options.takeover))).await?;
     // An error means that the listening has ended, which is told there.
     if tokio::time::timeout(options.timeout, is_ready).await.map_err(|_| within("no answer to the hello"))?.is_err() {
         return Err(Unsent::Lost);
@@ -268,10 +270,23 @@ async fn publish<R: BufRead>(
             }
             report.frames += 1;
         }
-        write(feed.text().to_owned()).await?;
+        let binary = if options.binary && item == FeedItem::Frame { binary_form(&frame, feed.text()) } else { None };
+        write(binary.unwrap_or_else(|| Message::text(feed.text()))).await?;
         progress.inc(feed.text().len() as u64 + 1);
     }
     Ok(())
+}
+
+/// A frame of landmarks in the binary form; `None` for what stays JSON: other frames, and those that also give expressions,
+/// which a sender's reader leaves out.
+fn binary_form(frame: &TrackingFrame, text: &str) -> Option<Message> {
+    let TrackingData::Landmarks { points, confidence } = &frame.data else { return None };
+    if text.contains("\"expressions\"") {
+        return None;
+    }
+    let mut bytes = Vec::new();
+    encode_landmarks(frame.t, points, confidence, &mut bytes).ok()?;
+    Some(Message::binary(bytes))
 }
 
 /// How a session came to its end.

@@ -149,7 +149,7 @@ pub async fn run(
     let hub = Arc::new(Hub {
         hello_character: ViewHello::new("", &character, character_url.clone()).character,
         layout: PacketLayout::from(&*character),
-        rooms: Rooms::new(config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
+        rooms: Rooms::new(character.clone(), config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
         trackers: Trackers::default(),
         listens_on_loopback: address.ip().is_loopback(),
         character,

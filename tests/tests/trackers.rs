@@ -270,7 +270,7 @@ fn a_port_of_ipv6_answers_phones_of_both_kinds() {
 
 #[test]
 fn a_room_that_is_taken_is_waited_for_and_a_silent_app_gives_way_to_its_successor() {
-    let server = listening(&["vmc=127.0.0.1:0,room=demo"]);
+    let server = listening(&["vmc=127.0.0.1:0,room=demo,slot=main"]);
     let face = |socket: &UdpSocket| {
         for bundle in vmc::write(20_000.0, Some(&[0.3; NUM_ARKIT_SHAPES]), Quat::IDENTITY) {
             socket.send_to(&bundle, port(&server, 0)).unwrap();

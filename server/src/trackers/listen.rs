@@ -8,11 +8,11 @@ use super::session::{Clock, Framer, Swaps, Tick, hello, room_of};
 use super::spec::{ListenSpec, RoomRule};
 use super::{Protocol, Refusal, Seen, Sight, fmv3, ifacialmocap, livelink, openseeface, sniff, vmc, vts};
 use crate::config::seconds;
-use crate::intake::{Begun, Intake, IntakeError};
 use crate::publish::Rate;
 use crate::room::Evicted;
 use crate::service::{Hub, ServerError, stopped};
-use rhytid_shared::RoomName;
+use crate::source::{FrameError, OpenError, Source};
+use rhytid_shared::{RoomName, Slot};
 use serde::Serialize;
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
@@ -68,7 +68,8 @@ pub(crate) struct PortListing {
 struct PerformerListing {
     source: String,
     room: String,
-    /// Its session in the room; nothing while another publisher has it.
+    slot: String,
+    /// Its session in the room; nothing while another publisher has its slot.
     session: Option<u32>,
     /// Seconds since its last datagram.
     silent: f64,
@@ -177,11 +178,13 @@ struct Key {
 struct Performer {
     source: String,
     room: RoomName,
+    slot: Slot,
     clock: Clock,
     rate: Rate,
     last_heard: Instant,
-    /// When the room may be asked for again.
+    /// When the slot may be asked for again, and why it was not to be had.
     retry_at: Instant,
+    refusal: &'static str,
     begun_at: Option<Instant>,
     num_sessions: u32,
     live: Option<Live>,
@@ -189,16 +192,18 @@ struct Performer {
 
 /// A performer's session in a room.
 struct Live {
-    intake: Intake,
+    source: Source,
     evicted: Evicted,
     framer: Framer,
     /// The picture that the session's landmarks are of.
     image: Option<[f32; 2]>,
 }
 
-impl Drop for Live {
-    fn drop(&mut self) {
-        self.intake.end();
+impl Performer {
+    /// Without a place in its room, which it asks for again later.
+    fn lose_slot(&mut self, now: Instant, why: &'static str) {
+        self.live = None;
+        (self.retry_at, self.refusal) = (now + RETRY, why);
     }
 }
 
@@ -340,10 +345,12 @@ impl<'a> Listener<'a> {
             let performer = Performer {
                 source: hello(protocol, &seen, from.ip()).source,
                 room,
+                slot: self.spec.slot_of(protocol),
                 clock: Clock::default(),
                 rate: Rate::new(self.hub.config.limits.frames_per_second, now),
                 last_heard: now,
                 retry_at: now,
+                refusal: "",
                 begun_at: None,
                 num_sessions: 0,
                 live: None,
@@ -373,8 +380,7 @@ impl<'a> Listener<'a> {
             performer.live = None;
         }
         if performer.live.as_mut().is_some_and(|live| live.evicted.try_recv().is_ok()) {
-            performer.live = None;
-            performer.retry_at = now + RETRY;
+            performer.lose_slot(now, "taken_over");
         }
         if performer.live.is_none() {
             if seen.sight == Sight::NoFace {
@@ -385,20 +391,18 @@ impl<'a> Listener<'a> {
         }
         let performer = self.performers.get_mut(&key).expect("nobody has removed it");
         let live = performer.live.as_mut().expect("the session has begun");
-        match live.intake.frame(self.hub, live.framer.frame(t, &seen.sight)) {
-            Ok(true) => {
+        match live.source.frame(self.hub, live.framer.frame(t, &seen.sight)) {
+            Ok(()) => {
                 self.hub.metrics.tracker_frame(protocol.name());
-                if live.intake.pipeline.take_calibrated().is_some() {
-                    live.intake.keep_neutral();
-                }
+                // Nobody is to be told; the room keeps it.
+                live.source.take_calibrated();
                 Ok(())
             }
-            Ok(false) => {
-                performer.live = None;
-                performer.retry_at = now + RETRY;
+            Err(FrameError::Evicted) => {
+                performer.lose_slot(now, "taken_over");
                 Err("taken_over")
             }
-            Err(error) => {
+            Err(FrameError::Bad(error)) => {
                 tracing::debug!(%from, %error, "frame refused");
                 Err("bad_frame")
             }
@@ -420,28 +424,29 @@ impl<'a> Listener<'a> {
         }
     }
 
-    /// Begins a session of the performer `key` in its room.
+    /// Begins a session of the performer `key` in its slot.
     fn begin(&mut self, key: &Key, protocol: Protocol, seen: &Seen, ip: IpAddr, now: Instant) -> Result<(), &'static str> {
         let performer = self.performers.get_mut(key).expect("sessions are of performers");
         if now < performer.retry_at {
-            return Err("room_taken");
+            return Err(performer.refusal);
         }
         if performer.begun_at.is_some_and(|begun| now - begun < RETRY) || !self.begins.take_if_free(now) {
             return Err("too_many_sessions");
         }
-        let (room, num_sessions) = (performer.room.clone(), performer.num_sessions);
+        let (room, slot, num_sessions) = (performer.room.clone(), performer.slot.clone(), performer.num_sessions);
         for (other, silent) in &mut self.performers {
-            if other != key && silent.room == room && now - silent.last_heard >= GIVES_WAY {
+            if other != key && silent.room == room && silent.slot == slot && now - silent.last_heard >= GIVES_WAY {
                 silent.live = None;
             }
         }
         let mut hello = hello(protocol, seen, ip);
         // The same tracker that begins anew sees the same face.
         hello.keep_neutral = num_sessions > 0;
-        let begun = Intake::begin(self.hub, &room, hello);
+        hello.slot = slot;
+        let begun = Source::open(self.hub, &room, hello);
         let performer = self.performers.get_mut(key).expect("sessions are of performers");
         match begun {
-            Ok(Begun { intake, evicted, .. }) => {
+            Ok((source, evicted)) => {
                 let usual = Swaps::usual(protocol);
                 let swaps = Swaps { jaw: self.spec.swap_jaw.unwrap_or(usual.jaw), mouth: self.spec.swap_mouth.unwrap_or(usual.mouth) };
                 let image = match seen.sight {
@@ -450,16 +455,17 @@ impl<'a> Listener<'a> {
                 };
                 performer.begun_at = Some(now);
                 performer.num_sessions = num_sessions.saturating_add(1);
-                performer.live = Some(Live { intake, evicted, framer: Framer::new(swaps), image });
+                performer.live = Some(Live { source, evicted, framer: Framer::new(swaps), image });
                 Ok(())
             }
             Err(error) => {
-                performer.retry_at = now + RETRY;
                 tracing::debug!(%room, source = performer.source, %error, "tracker has no room");
-                Err(match error {
-                    IntakeError::Hello(_) => "bad_frame",
-                    IntakeError::Room(error) => error.code(),
-                })
+                let refusal = match error {
+                    OpenError::Hello(_) => "bad_frame",
+                    OpenError::Room(error) => error.code(),
+                };
+                performer.lose_slot(now, refusal);
+                Err(refusal)
             }
         }
     }
@@ -514,7 +520,8 @@ impl<'a> Listener<'a> {
             .map(|performer| PerformerListing {
                 source: performer.source.clone(),
                 room: performer.room.to_string(),
-                session: performer.live.as_ref().map(|live| live.intake.place.session),
+                slot: performer.slot.name.clone(),
+                session: performer.live.as_ref().map(|live| live.source.session()),
                 silent: (now - performer.last_heard).as_secs_f64(),
             })
             .collect();

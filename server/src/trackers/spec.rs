@@ -3,7 +3,7 @@
 use super::Protocol;
 use super::fmv3;
 use super::ifacialmocap::Dialect;
-use rhytid_shared::RoomName;
+use rhytid_shared::{ChannelGroup, ChannelGroups, RoomName, Slot};
 use serde::Deserialize;
 use std::net::{IpAddr, SocketAddr};
 use std::str::FromStr;
@@ -35,6 +35,12 @@ pub struct ListenSpec {
     pub address: SocketAddr,
     /// Which room.
     pub room: RoomRule,
+    /// The source slot, by default called as the protocol.
+    pub slot: Option<RoomName>,
+    /// Higher wins, 0 to 100.
+    pub priority: u8,
+    /// The groups of the face that it may drive.
+    pub groups: ChannelGroups,
     /// Where datagrams may come from; empty: anywhere.
     pub allow: Vec<IpAddr>,
     /// The phone that is asked to send.
@@ -72,6 +78,9 @@ impl FromStr for ListenSpec {
             protocol,
             address: parse("address", address, "an IP address and a port")?,
             room: RoomRule::Named(room_name("demo")?),
+            slot: None,
+            priority: Slot::PRIORITY,
+            groups: ChannelGroups::ALL,
             allow: Vec::new(),
             phone: None,
             dialect: (protocol == Some(Protocol::IFacialMocap)).then_some(Dialect::V2),
@@ -100,6 +109,24 @@ impl ListenSpec {
         match key {
             "room" if value == "subject" => self.room = RoomRule::Subject,
             "room" => self.room = RoomRule::Named(room_name(value)?),
+            "slot" => self.slot = Some(room_name(value)?),
+            "priority" => {
+                let priority = parse("option priority", value, "0 to 100")?;
+                if priority > 100 {
+                    return Err(SpecError(format!("option priority is {priority}, expected 0 to 100")));
+                }
+                self.priority = priority;
+            }
+            "groups" => {
+                self.groups = ChannelGroups::NONE;
+                for group in value.split('+') {
+                    let known = ChannelGroup::from_name(group).ok_or_else(|| {
+                        let all = ChannelGroup::ALL.map(ChannelGroup::name).join(", ");
+                        SpecError(format!("option groups has {:?}, expected some of {all} with + between them", cut(group)))
+                    })?;
+                    self.groups = self.groups.with(known);
+                }
+            }
             "allow" => {
                 if self.allow.len() == MOST_ALLOWED {
                     return Err(SpecError(format!("more than {MOST_ALLOWED} options allow")));
@@ -127,6 +154,12 @@ impl ListenSpec {
             }
         }
         Ok(())
+    }
+
+    /// The slot of a performer whose datagrams are of this protocol.
+    pub(super) fn slot_of(&self, protocol: Protocol) -> Slot {
+        let name = self.slot.as_ref().map_or_else(|| protocol.name().to_owned(), ToString::to_string);
+        Slot { name, priority: self.priority, groups: self.groups }
     }
 
     /// True where [`fmv3::hello`] is what the phone is asked with.
@@ -208,11 +241,19 @@ mod tests {
     fn options_are_read() {
         let spec: ListenSpec = "openseeface=127.0.0.1:11573,room=demo".parse().unwrap();
         assert_eq!((spec.protocol, spec.address.port(), spec.allow.len()), (Some(Protocol::OpenSeeFace), 11573, 0));
-        let spec: ListenSpec = "ifacialmocap=0.0.0.0:49983,phone=192.0.2.7:49983,room=subject,version=3,swap_jaw=true".parse().unwrap();
-        assert_eq!(spec.room, RoomRule::Subject);
+        let spec: ListenSpec =
+            "ifacialmocap=0.0.0.0:49983,phone=192.0.2.7:49983,room=subject,slot=phone,priority=70,groups=mouth+head,version=3,swap_jaw=true"
+                .parse()
+                .unwrap();
+        assert_eq!((spec.room.clone(), spec.slot_of(Protocol::Fmv3)), {
+            let groups = ChannelGroups::NONE.with(ChannelGroup::Mouth).with(ChannelGroup::Head);
+            (RoomRule::Subject, Slot { name: "phone".into(), priority: 70, groups })
+        });
         assert_eq!(spec.allow, ["192.0.2.7".parse::<IpAddr>().unwrap()], "only the phone that is asked may answer");
         assert!(spec.asks_fmv3() && spec.swap_jaw == Some(true) && spec.swap_mouth.is_none());
         assert_eq!("any=[::1]:9".parse::<ListenSpec>().unwrap().protocol, None);
+        let plain = Slot { name: "vts".into(), ..Slot::default() };
+        assert_eq!("any=[::1]:9".parse::<ListenSpec>().unwrap().slot_of(Protocol::Vts), plain);
         let out: VmcOutSpec = "127.0.0.1:39539,room=stage".parse().unwrap();
         assert_eq!((out.address.port(), out.room.as_str()), (39539, "stage"));
     }
