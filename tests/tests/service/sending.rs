@@ -38,9 +38,9 @@ fn a_feed_sent_in_the_binary_form_gives_nearly_the_same_face() {
     for (room, binary) in [("text", false), ("bytes", true)] {
         let mut viewer = server.viewer(room);
         let options = SendOptions { binary, room: room.into(), ..options(&server, lines.join("\n")) };
-        let before = server.metric("rhytid_bytes_in_total");
+        let before = server.metric("rhytid_in_bytes_total");
         assert_eq!(send_now(&options).unwrap(), SendReport { frames: 60, errors: 0 });
-        let num_bytes = server.metric("rhytid_bytes_in_total") - before;
+        let num_bytes = server.metric("rhytid_in_bytes_total") - before;
         while viewer.frame.seq < 59 {
             assert!(viewer.next_packet());
         }
