@@ -300,7 +300,11 @@ impl Mixer {
 
 /// The rotation at `share` of the way, the short way round.
 fn between(from: Quat, to: Quat, share: f32) -> Quat {
-    from.lerp(to, share)
+    let (from, to) = (from.as_dquat(), to.as_dquat());
+    let to = if from.x * to.x + from.y * to.y + from.z * to.z + from.w * to.w < 0.0 { -to } else { to };
+    let sum = from * f64::from(1.0 - share) + to * f64::from(share);
+    let length = (sum.x * sum.x + sum.y * sum.y + sum.z * sum.z + sum.w * sum.w).sqrt();
+    (sum * (1.0 / length)).as_quat()
 }
 
 /// `0..=1` to `0..=1` without a jerk at either end.

@@ -149,7 +149,9 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn decoded(bytes: &[u8], expected: usize) -> Result<(f64, Vec<[f32; 3]>, Vec<f32>), MessageError> {
+    type Decoded = (f64, Vec<[f32; 3]>, Vec<f32>);
+
+    fn decoded(bytes: &[u8], expected: usize) -> Result<Decoded, MessageError> {
         let (mut points, mut confidence) = (vec![[9.0; 3]; 3], vec![9.0; 3]);
         decode(bytes, expected, &mut points, &mut confidence).map(|t| (t, points, confidence))
     }
