@@ -134,7 +134,8 @@ pub struct PictureArgs {
     /// Pixels, WIDTHxHEIGHT
     #[arg(long, default_value = "512x512", value_parser = parse_size)]
     pub size: [u32; 2],
-    /// beauty, bare, split, influence, influence:POSE, normals, wireframe, diffuse, specular, scattering, translucency or blood
+    /// beauty, bare, split, influence, influence:POSE, normals, wireframe, diffuse, specular, scattering, translucency, blood, masks, masks:ZONE, bone-masks
+    /// or shape-deltas
     #[arg(long, default_value = "beauty")]
     pub view: String,
     /// How wrinkle maps become normals: pd, simple or printed
@@ -355,6 +356,12 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
     while let Some(item) = feed.next_frame(&mut tracked)? {
         match item {
             FeedItem::Calibrate => solver.calibrate(),
+            FeedItem::Settings(change) => {
+                solver.set(&change).map_err(|source| PictureError::Frame { path: path.clone(), line: feed.line(), source })?;
+            }
+            FeedItem::Recentre => {
+                solver.recentre();
+            }
             FeedItem::Frame => {
                 solver.solve(&tracked, &mut solved).map_err(|source| PictureError::Frame {
                     path: path.clone(),

@@ -5,7 +5,7 @@ use crate::recording::RecordedFeed;
 use crate::trackers::livelink_csv::LiveLinkCsv;
 use crate::trackers::openseeface_csv::{self, OpenSeeFaceCsv};
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
-use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
+use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, Settings, TrackingFrame};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -34,12 +34,16 @@ pub enum FeedError {
 }
 
 /// What stands on a line after the hello.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FeedItem {
     /// A frame, written into the buffer given.
     Frame,
     /// Take the neutral face now.
     Calibrate,
+    /// Take over some settings from the next frame on.
+    Settings(Settings),
+    /// The head's present pose is straight ahead.
+    Recentre,
 }
 
 /// The lines of a feed file, whatever it is on the disk.
@@ -87,7 +91,7 @@ impl<R: BufRead> Feed<R> {
         if feed.next_line()? {
             match feed.read(&mut TrackingFrame::default())? {
                 PublishMessage::Hello(first) => hello = first,
-                PublishMessage::Frame | PublishMessage::Calibrate => return Err(feed.refuse(MessageError::new("no_hello", NO_HELLO))),
+                _ => return Err(feed.refuse(MessageError::new("no_hello", NO_HELLO))),
             }
         } else {
             feed.line = 1;
@@ -104,6 +108,8 @@ impl<R: BufRead> Feed<R> {
         match self.read(frame)? {
             PublishMessage::Frame => Ok(Some(FeedItem::Frame)),
             PublishMessage::Calibrate => Ok(Some(FeedItem::Calibrate)),
+            PublishMessage::Settings(change) => Ok(Some(FeedItem::Settings(change))),
+            PublishMessage::Recentre => Ok(Some(FeedItem::Recentre)),
             PublishMessage::Hello(_) => Err(self.refuse(MessageError::new("repeated_hello", "a feed has one hello, its first line"))),
         }
     }

@@ -4,13 +4,13 @@ use crate::config::Access;
 use crate::recording::{PlayError, PlayRequest, RecordError, RecorderStatus};
 use crate::service::{self, Hub, Peer};
 use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
-use crate::{publish, viewer};
+use crate::{page, publish, viewer};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
-use axum::response::{Html, IntoResponse, Response};
+use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use rhytid_shared::RoomName;
 use std::net::IpAddr;
@@ -20,7 +20,7 @@ use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 /// All routes.
 pub(crate) fn router(hub: Arc<Hub>) -> Router {
     Router::new()
-        .route("/", get(page))
+        .route("/", get(start_page))
         .route("/healthz", get(async || "ok\n"))
         .route("/metrics", get(metrics))
         .route("/api/rooms", get(rooms))
@@ -31,7 +31,7 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
         .route("/characters/{file}", get(character))
         .route("/v1/rooms/{room}/publish", get(publish_socket))
         .route("/v1/rooms/{room}/view", get(view_socket))
-        .fallback(async || ErrorMessage::new("not_found", "there is nothing at this address").response(StatusCode::NOT_FOUND))
+        .fallback(other)
         .layer(from_fn_with_state(hub.clone(), check_browser))
         .with_state(hub)
 }
@@ -104,8 +104,13 @@ fn host_name(host: &str) -> &str {
     }
 }
 
-async fn page() -> Html<&'static str> {
-    Html(include_str!("page.html"))
+async fn start_page(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    page::answer(request.method(), "/", request.headers(), &hub.config.access).unwrap_or_else(|| page::stand_in(&hub.config.access))
+}
+
+async fn other(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    page::answer(request.method(), request.uri().path(), request.headers(), &hub.config.access)
+        .unwrap_or_else(|| ErrorMessage::new("not_found", "there is nothing at this address").response(StatusCode::NOT_FOUND))
 }
 
 /// In Prometheus's own format, or as OpenMetrics where the reader names that.

@@ -7,9 +7,10 @@ use rhytid_server::recording::{
     Faces, PlayRequest, RecordConfig, Recording, RecoverReport, VerifyReport, export_csv, export_gltf, recover, verify, watch,
 };
 use rhytid_server::{
-    Access, Clip, FakeKind, FakeOptions, Limits, ListenSpec, Play, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, VmcOutSpec,
-    bind, fake, load_character, run, send,
+    Access, Clip, FakeKind, FakeOptions, Identity, Limits, ListenSpec, Play, SendOptions, SendReport, SendSource, ServerConfig, Timeouts,
+    Tls, VmcOutSpec, bind, fake, load_character, run, send,
 };
+use rhytid_shared::trust::Trust;
 use rhytid_shared::{Character, RoomName};
 use std::io::Write;
 use std::net::SocketAddr;
@@ -67,6 +68,10 @@ struct RecordArgs {
     /// Stop after so many seconds.
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     seconds: Option<Duration>,
+    /// Whom to trust on wss://: the fingerprint that `serve --tls-self-signed` printed, or a PEM file of authorities; else the
+    /// public ones
+    #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
+    trust: Trust,
 }
 
 #[derive(Args)]
@@ -104,6 +109,10 @@ struct ReplayArgs {
     /// Take the room over from another publisher.
     #[arg(long)]
     takeover: bool,
+    /// Whom to trust on wss://: the fingerprint that `serve --tls-self-signed` printed, or a PEM file of authorities; else the
+    /// public ones
+    #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
+    trust: Trust,
 }
 
 #[derive(Args)]
@@ -166,7 +175,7 @@ struct ServeArgs {
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
     /// A port for other programs' trackers, PROTOCOL one of any, openseeface, livelink, ifacialmocap, fmv3, vmc and vts; options
-    /// room=NAME|subject, slot=NAME, priority=0..100, groups=brows+lids+gaze+mouth+head, allow=IP, phone=IP:PORT,
+    /// room=NAME|subject, allow=IP, phone=IP:PORT,
     /// version=1|2|3|facemotion3d, swap_jaw=BOOL, swap_mouth=BOOL (repeat for several).
     #[arg(long, value_name = "PROTOCOL=IP:PORT[,OPTION=VALUE…]")]
     listen_udp: Vec<ListenSpec>,
@@ -181,6 +190,8 @@ struct ServeArgs {
     access: Access,
     #[command(flatten)]
     record: RecordConfig,
+    #[command(flatten)]
+    tls: Tls,
 }
 
 #[derive(Args)]
@@ -209,9 +220,20 @@ struct SendArgs {
     /// Take the room over from another publisher.
     #[arg(long)]
     takeover: bool,
+    /// Send frames of landmarks in the binary form, a twelfth of the bytes.
+    #[arg(long)]
+    binary: bool,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     #[arg(long, default_value = "15", value_name = "SECONDS", value_parser = parse_seconds)]
     timeout: Duration,
+    /// Whom to trust on wss://: the fingerprint that `serve --tls-self-signed` printed, or a PEM file of authorities; else the
+    /// public ones
+    #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
+    trust: Trust,
+}
+
+fn parse_trust(text: &str) -> Result<Trust, String> {
+    if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
 }
 
 #[derive(Args)]
@@ -334,6 +356,10 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);
     config.access.origins.extend(args.access.origins);
+    // Given by flags it is whole, whatever the file says.
+    if args.tls != Tls::default() {
+        config.tls = args.tls;
+    }
     config.validate()?;
     raise_file_limit();
     // Before the port is bound: who sees its line may connect, and a broken character must not leave a port behind.
@@ -345,12 +371,18 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
 async fn serve_until_signal(config: ServerConfig, character: (Arc<Character>, Vec<u8>)) -> anyhow::Result<()> {
     let mut interrupt = Signals::new().context("cannot wait for signals")?;
     let listener = bind(&config.listen).await?;
+    let identity = Identity::load(&config.tls, listener.local_addr()?, &config.access.hosts)?;
+    let scheme = if identity.is_some() { "https" } else { "http" };
+    let mut greeting = format!("listening on {scheme}://{}\n", listener.local_addr()?);
+    if let Some(identity) = &identity {
+        greeting += &format!("certificate SHA-256 {}\n", identity.fingerprint());
+    }
     let mut output = std::io::stdout();
-    if let Err(error) = writeln!(output, "listening on http://{}", listener.local_addr()?).and_then(|()| output.flush()) {
+    if let Err(error) = output.write_all(greeting.as_bytes()).and_then(|()| output.flush()) {
         // Who closed it does not want to know; who connects is served all the same.
         tracing::warn!(%error, "cannot write to standard output");
     }
-    run(listener, config, character, async move { interrupt.wait().await }).await?;
+    run(listener, config, character, identity, async move { interrupt.wait().await }).await?;
     Ok(())
 }
 
@@ -413,7 +445,7 @@ async fn record_room(args: RecordArgs) -> anyhow::Result<()> {
             () = tokio::time::sleep(args.seconds.unwrap_or(Duration::MAX / 4)) => {}
         }
     };
-    let (packets, bytes) = watch(&args.server, room.as_str(), &args.out, stop).await?;
+    let (packets, bytes) = watch(&args.server, room.as_str(), &args.trust, &args.out, stop).await?;
     println!("{packets} packets in {bytes} bytes");
     Ok(())
 }
@@ -426,8 +458,9 @@ async fn replay_file(args: ReplayArgs) -> anyhow::Result<()> {
     if !args.packets {
         let source = SendSource::Recording(args.file, [args.from, args.to]);
         let (to, room, takeover) = (args.server, room.to_string(), args.takeover);
-        let timeout = Duration::from_secs(15);
-        return send_with_progress(SendOptions { source, to, room, speed: args.speed, repeats: args.repeats, takeover, timeout }).await;
+        let (timeout, trust) = (Duration::from_secs(15), args.trust);
+        let (speed, repeats) = (args.speed, args.repeats);
+        return send_with_progress(SendOptions { source, to, room, speed, repeats, takeover, binary: false, timeout, trust }).await;
     }
     let request = PlayRequest {
         speed: Some(args.speed),
@@ -523,7 +556,9 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         speed: args.speed,
         repeats: args.repeats,
         takeover: args.takeover,
+        binary: args.binary,
         timeout: args.timeout,
+        trust: args.trust,
     };
     send_with_progress(options).await
 }

@@ -3,7 +3,7 @@
 
 use crate::solve::{Calibration, CalibrationReport, DelayReport, SolveConfig, SolveError, Solver};
 use rhytid_shared::packet::{Encoder, PacketKind};
-use rhytid_shared::{Character, FaceFrame, PublishHello, TrackingFrame};
+use rhytid_shared::{Character, FaceFrame, PublishHello, Settings, TrackingFrame};
 use std::sync::Arc;
 
 /// Solves and encodes the frames of one session.
@@ -57,14 +57,29 @@ impl Pipeline {
         Ok(())
     }
 
-    /// The second half of [`Self::frame`].
-    pub(crate) fn encode(&mut self, packet: &mut Vec<u8>) -> PacketKind {
+    /// The second half of [`Self::frame`]; in a room the room encodes.
+    fn encode(&mut self, packet: &mut Vec<u8>) -> PacketKind {
         self.encoder.encode(&self.face, packet)
     }
 
     /// Takes the neutral face now.
     pub fn calibrate(&mut self) {
         self.solver.calibrate();
+    }
+
+    /// Takes over some settings, which have been checked, from the next frame on.
+    pub fn set(&mut self, change: &Settings) -> Result<(), SolveError> {
+        self.solver.set(change)
+    }
+
+    /// The settings in use.
+    pub fn settings(&self) -> &Settings {
+        self.solver.settings()
+    }
+
+    /// Makes the head's present pose straight ahead; false where no face has been seen yet.
+    pub fn recentre(&mut self) -> bool {
+        self.solver.recentre()
     }
 
     /// A neutral that has been reached since the last call.

@@ -1,14 +1,14 @@
 //! One publisher: its messages are read, solved, encoded and put into its room, in the order they come.
 
 use crate::config::seconds;
-use crate::intake::{Begun, Intake, IntakeError};
 use crate::room::RoomError;
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
 use crate::solve::DelayReport;
+use crate::source::{FrameError, OpenError, Sent, Source};
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
-use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
+use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, Settings, TrackingFrame};
 use serde::Serialize;
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -34,6 +34,14 @@ enum Answer<'a> {
         /// Names that `bones` frames may use.
         bones: Vec<&'a str>,
     },
+    /// The settings in use.
+    Settings {
+        #[serde(flatten)]
+        settings: &'a Settings,
+        added_delay: DelayReport,
+    },
+    /// The head's present pose is straight ahead.
+    Recentred,
     /// A neutral face has been taken.
     Calibrated {
         /// Sender's time at which it was reached, seconds.
@@ -61,6 +69,9 @@ pub(crate) fn socket_config(hub: &Hub) -> WebSocketConfig {
 /// Calibrations a second from one publisher: each may solve all its frames of the last seconds anew.
 const CALIBRATIONS_PER_SECOND: u32 = 2;
 
+/// Changes of settings a second from one publisher: a knob that is turned on a page.
+const SETTINGS_PER_SECOND: u32 = 30;
+
 /// Takes a publisher's messages until one side ends it.
 pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName) {
     let Err(stop) = publish(&hub, &mut socket, &room).await;
@@ -84,20 +95,18 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infa
             Err(_) => return Err(refusal("hello_timeout", format!("no hello within {} seconds", timeouts.hello))),
         },
     };
-    let Begun { intake, evicted, kept_neutral } = Intake::begin(hub, room, hello, Some(text)).map_err(refused)?;
+    let (source, evicted) = Source::open(hub, room, hello, Some(text)).map_err(not_opened)?;
     let heard = Heard::now();
-    let mut session = Session::new(hub, intake, reader);
-    let stop = tokio::select! {
+    let mut session = Session::new(hub, source, reader);
+    Err(tokio::select! {
         biased;
         () = stopped(&mut shutdown) => Ending::shutdown().into(),
         _ = evicted => taken_over(),
-        result = session.run(socket, &heard, kept_neutral) => match result { Err(stop) => stop },
+        result = session.run(socket, &heard) => match result { Err(stop) => stop },
         () = heard.silence(seconds(timeouts.publisher_idle)) => {
             refusal("idle", format!("nothing heard for {} seconds", timeouts.publisher_idle))
         }
-    };
-    session.intake.end();
-    Err(stop)
+    })
 }
 
 /// Reads up to the hello.
@@ -106,47 +115,49 @@ async fn read_hello(hub: &Hub, socket: &mut Socket, reader: &mut PublishReader) 
     hub.metrics.bytes_in.inc_by(text.len() as u64);
     match reader.read(&text, &mut TrackingFrame::default()) {
         Ok(PublishMessage::Hello(hello)) => Ok((hello, text)),
-        Ok(PublishMessage::Frame | PublishMessage::Calibrate) => unreachable!("the reader refuses both before a hello"),
+        Ok(_) => unreachable!("the reader refuses all else before a hello"),
         Err(MessageError { code, message }) => Err(refusal(code, message)),
     }
 }
 
-/// A publisher that has claimed its room.
+/// A publisher that has claimed its slot.
 struct Session<'a> {
     hub: &'a Hub,
-    intake: Intake,
+    source: Source,
     reader: PublishReader,
     frame: TrackingFrame,
     messages: Rate,
     calibrations: Rate,
+    settings: Rate,
     /// The sender knows that it is too fast.
     has_told_rate: bool,
     num_bad_in_a_row: u32,
 }
 
 impl<'a> Session<'a> {
-    fn new(hub: &'a Hub, intake: Intake, reader: PublishReader) -> Self {
+    fn new(hub: &'a Hub, source: Source, reader: PublishReader) -> Self {
         let now = Instant::now();
         Self {
             hub,
-            intake,
+            source,
             reader,
             frame: TrackingFrame::default(),
             messages: Rate::new(hub.config.limits.frames_per_second, now),
             calibrations: Rate::new(CALIBRATIONS_PER_SECOND, now),
+            settings: Rate::new(SETTINGS_PER_SECOND, now),
             has_told_rate: false,
             num_bad_in_a_row: 0,
         }
     }
 
     /// Says that it is ready and takes messages until the session ends. May be dropped at any await.
-    async fn run(&mut self, socket: &mut Socket, heard: &Heard, kept_neutral: bool) -> Result<Infallible, Stop> {
+    async fn run(&mut self, socket: &mut Socket, heard: &Heard) -> Result<Infallible, Stop> {
         let character = &self.hub.character;
         let ready = Answer::Ready {
             version: PROTOCOL_VERSION,
-            room: self.intake.place.room.name.as_str(),
-            session: self.intake.place.session,
-            kept_neutral,
+            room: self.source.room().as_str(),
+            session: self.source.session(),
+            kept_neutral: self.source.kept_neutral,
             character: &character.name,
             bones: character.bones.iter().map(|bone| bone.name.as_str()).collect(),
         };
@@ -167,11 +178,13 @@ impl<'a> Session<'a> {
             match message {
                 Some(Ok(Message::Text(text))) => {
                     self.hub.metrics.bytes_in.inc_by(text.len() as u64);
-                    self.take(socket, text).await?;
+                    let message = self.reader.read(&text, &mut self.frame);
+                    self.take(socket, message, Sent::Text(text)).await?;
                 }
                 Some(Ok(Message::Binary(bytes))) => {
                     self.hub.metrics.bytes_in.inc_by(bytes.len() as u64);
-                    self.refuse(socket, bytes, ErrorMessage::new("binary_message", BINARY)).await?;
+                    let message = self.reader.read_binary(&bytes, &mut self.frame);
+                    self.take(socket, message, Sent::Binary(bytes)).await?;
                 }
                 Some(Ok(Message::Close(_))) | None => return Err(Stop::Gone("closed")),
                 Some(Ok(_)) => {}
@@ -181,38 +194,56 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Takes one text message.
-    async fn take(&mut self, socket: &mut Socket, text: Utf8Bytes) -> Result<(), Stop> {
-        match self.reader.read(&text, &mut self.frame) {
+    /// Takes one message as it was read.
+    async fn take(&mut self, socket: &mut Socket, message: Result<PublishMessage, MessageError>, sent: Sent) -> Result<(), Stop> {
+        match message {
             Ok(PublishMessage::Calibrate) => {
                 if self.calibrations.take_if_free(Instant::now()) {
-                    self.intake.calibrate(text);
+                    self.source.calibrate();
+                    self.source.record_taken(sent);
                 } else {
                     let message = format!("more than {CALIBRATIONS_PER_SECOND} calibrations a second: this one is left out");
-                    return self.refuse(socket, text.into(), ErrorMessage::new("too_many_calibrations", message)).await;
+                    return self.refuse(socket, sent, ErrorMessage::new("too_many_calibrations", message)).await;
                 }
+            }
+            // Other sides begin another search, so these are held to the rate of calibrations, too.
+            Ok(PublishMessage::Settings(_) | PublishMessage::Recentre) if !self.settings.take_if_free(Instant::now()) => {
+                let message = format!("more than {SETTINGS_PER_SECOND} changes of settings a second: this one is left out");
+                return self.refuse(socket, sent, ErrorMessage::new("too_many_settings", message)).await;
+            }
+            Ok(PublishMessage::Settings(change)) => {
+                if let Err(error) = self.source.set(&change) {
+                    return self.refuse(socket, sent, ErrorMessage::new("bad_settings", error.to_string())).await;
+                }
+                self.source.record_taken(sent);
+                let answer = Answer::Settings { settings: self.source.settings(), added_delay: self.source.added_delay() };
+                send_json(socket, &answer, seconds(self.hub.config.timeouts.write)).await?;
+            }
+            Ok(PublishMessage::Recentre) => {
+                if !self.source.recentre() {
+                    let message = "no face has been seen yet, expected one to re-centre";
+                    return self.refuse(socket, sent, ErrorMessage::new("no_face", message)).await;
+                }
+                self.source.record_taken(sent);
+                send_json(socket, &Answer::Recentred, seconds(self.hub.config.timeouts.write)).await?;
             }
             Ok(PublishMessage::Hello(_)) => unreachable!("the reader refuses a second hello"),
-            Ok(PublishMessage::Frame) => {
-                match self.intake.frame(self.hub, &self.frame, Some(&text)) {
-                    Ok(true) => {}
-                    Ok(false) => return Err(taken_over()),
-                    Err(error) => {
-                        self.reader.take_back();
-                        return self.refuse(socket, text.into(), ErrorMessage::new("bad_frame", error.to_string())).await;
-                    }
+            Ok(PublishMessage::Frame) => match self.source.frame(self.hub, &self.frame, Some(sent.clone())) {
+                Ok(()) => self.num_bad_in_a_row = 0,
+                Err(FrameError::Evicted) => return Err(taken_over()),
+                Err(FrameError::Bad(error)) => {
+                    self.reader.take_back();
+                    return self.refuse(socket, sent, ErrorMessage::new("bad_frame", error.to_string())).await;
                 }
-                self.num_bad_in_a_row = 0;
-            }
-            Err(error) => return self.refuse(socket, text.into(), ErrorMessage::new(error.code, error.message)).await,
+            },
+            Err(error) => return self.refuse(socket, sent, ErrorMessage::new(error.code, error.message)).await,
         }
-        if let Some(report) = self.intake.pipeline.take_calibrated() {
-            self.intake.keep_neutral();
+        if let Some(report) = self.source.take_calibrated() {
             let answer = Answer::Calibrated {
                 t: report.t,
                 frames: report.num_frames,
                 requested: report.requested,
-                added_delay: self.intake.pipeline.added_delay(),
+                added_delay: self.source.added_delay(),
             };
             send_json(socket, &answer, seconds(self.hub.config.timeouts.write)).await?;
         }
@@ -235,11 +266,11 @@ impl<'a> Session<'a> {
     }
 
     /// Counts a bad message and says what is wrong with it; too many in a row end the session.
-    async fn refuse(&mut self, socket: &mut Socket, bytes: Bytes, error: ErrorMessage) -> Result<(), Stop> {
-        self.intake.refuse(bytes);
+    async fn refuse(&mut self, socket: &mut Socket, sent: Sent, error: ErrorMessage) -> Result<(), Stop> {
+        self.source.record_refused(sent);
         self.hub.metrics.drop_frames(error.code, 1);
         self.num_bad_in_a_row += 1;
-        tracing::debug!(room = %self.intake.place.room.name, code = error.code, message = error.message, "bad message from publisher");
+        tracing::debug!(room = %self.source.room(), code = error.code, message = error.message, "bad message from publisher");
         send_json(socket, &error, seconds(self.hub.config.timeouts.write)).await?;
         let most = self.hub.config.limits.bad_frames_in_a_row;
         if self.num_bad_in_a_row >= most {
@@ -249,7 +280,7 @@ impl<'a> Session<'a> {
     }
 }
 
-const BINARY: &str = "message is binary, expected JSON text";
+const BINARY: &str = "the first message is binary, expected the hello as JSON text";
 
 /// The first text message.
 async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<Utf8Bytes, Stop> {
@@ -266,14 +297,18 @@ async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<Utf8Bytes, Stop> {
     }
 }
 
-fn refused(error: IntakeError) -> Stop {
-    let message = error.to_string();
-    let (close, code) = match error {
-        IntakeError::Hello(_) => (CloseCode::Policy, "bad_hello"),
-        IntakeError::Room(RoomError::Taken) => (CloseCode::Policy, RoomError::Taken.code()),
-        IntakeError::Room(error) => (CloseCode::Again, error.code()),
-    };
-    Ending::error(close, ErrorMessage::new(code, message)).into()
+/// The end of a publisher that could not enter its room.
+fn not_opened(error: OpenError) -> Stop {
+    match error {
+        OpenError::Hello(_) => refusal("bad_hello", error.to_string()),
+        OpenError::Room(refused) => {
+            let code = match refused {
+                RoomError::Taken | RoomError::SlotTaken => CloseCode::Policy,
+                RoomError::TooManyRooms { .. } | RoomError::TooManyViewers { .. } | RoomError::TooManySlots { .. } => CloseCode::Again,
+            };
+            Ending::error(code, ErrorMessage::new(refused.code(), refused.to_string())).into()
+        }
+    }
 }
 
 /// The end of a publisher that does not keep the rules.

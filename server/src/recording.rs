@@ -19,7 +19,7 @@ mod writer;
 
 pub use export::{ExportError, export_csv, export_gltf};
 pub use faces::{Faces, Moment};
-pub use feed::RecordedFeed;
+pub use feed::{RecordedFeed, RecordedSession};
 pub use format::{Entry, SessionEvent, Topic};
 pub(crate) use player::Players;
 pub use player::{PlayError, PlayRequest, PlayStatus};

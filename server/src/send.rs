@@ -2,27 +2,29 @@
 
 use crate::clip::Clip;
 use crate::feed::{Feed, FeedError, FeedItem};
-use crate::recording::{ReadError, RecordedFeed, Recording};
+use crate::recording::{ReadError, RecordedFeed, RecordedSession, Recording};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use indicatif::ProgressBar;
-use rhytid_shared::TrackingFrame;
+use rhytid_shared::trust::Trust;
 use rhytid_shared::view::SUBPROTOCOL;
+use rhytid_shared::{TrackingData, TrackingFrame, encode_landmarks};
 use serde::Deserialize;
+use std::collections::BTreeMap;
 use std::future::Future;
 use std::io::{BufRead, Cursor};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpStream;
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::http::{HeaderValue, header};
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::{self, Message};
-use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
+use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
 
 /// How long the server may take to read what is on its way and to close.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(120);
@@ -63,8 +65,8 @@ pub enum SendSource {
     Text(String, String),
     /// An animation clip, and what to call it.
     Clip(Arc<Clip>, String),
-    /// What the publishers of a recording sent, one session after the other, from the first time to the second, seconds since the
-    /// recording began.
+    /// What the publishers of a recording sent, each slot's sessions one after the other, from the first time to the second, seconds
+    /// since the recording began.
     Recording(PathBuf, [f64; 2]),
 }
 
@@ -83,8 +85,12 @@ pub struct SendOptions {
     pub repeats: bool,
     /// Take the room over from another publisher.
     pub takeover: bool,
+    /// Send frames of landmarks in the binary form, a twelfth of the bytes; what it has no room for stays JSON.
+    pub binary: bool,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     pub timeout: Duration,
+    /// Whom to trust where `to` is `wss://`.
+    pub trust: Trust,
 }
 
 /// What was sent.
@@ -117,23 +123,7 @@ pub async fn send(options: &SendOptions, progress: &ProgressBar, stop: impl Futu
             }
             SendSource::Recording(path, range) => {
                 progress.set_length(std::fs::metadata(path).map_or(0, |file| file.len()));
-                let mut ending = Ending::Sent;
-                for index in 0.. {
-                    let shown = path.display().to_string();
-                    let feed = RecordedFeed::session(Recording::open(path)?, index, *range)?;
-                    let Ok(feed) = feed else {
-                        if index == 0 {
-                            let problem = "it has no publisher's messages from their beginning: play its packets with --packets".into();
-                            return Err(ReadError::Broken { path: shown, problem }.into());
-                        }
-                        break;
-                    };
-                    ending = send_once(Feed::new_for_any_character(feed, shown)?, options, progress, &mut report, stop.as_mut()).await?;
-                    if ending == Ending::Stopped {
-                        break;
-                    }
-                }
-                ending
+                send_recording(path, *range, options, progress, &mut report, stop.as_mut()).await?
             }
             SendSource::Clip(clip, name) => {
                 progress.set_length(clip.num_bytes());
@@ -145,6 +135,68 @@ pub async fn send(options: &SendOptions, progress: &ProgressBar, stop: impl Futu
             return Ok(report);
         }
     }
+}
+
+/// Sends the sessions of a recording as they came: those of one slot one after the other, slots beside each other.
+async fn send_recording(
+    path: &Path,
+    range: [f64; 2],
+    options: &SendOptions,
+    progress: &ProgressBar,
+    report: &mut SendReport,
+    stop: Pin<&mut impl Future<Output = ()>>,
+) -> Result<Ending, SendError> {
+    let mut slots: BTreeMap<String, Vec<RecordedSession>> = BTreeMap::new();
+    for session in RecordedFeed::sessions(&mut Recording::open(path)?, range)? {
+        slots.entry(session.slot.clone()).or_default().push(session);
+    }
+    let shown = path.display().to_string();
+    if slots.is_empty() {
+        let problem = "it has no publisher's messages from their beginning there: play its packets with --packets".into();
+        return Err(ReadError::Broken { path: shown, problem }.into());
+    }
+    let begun = Instant::now();
+    let (stopping, stopped) = watch::channel(false);
+    let send_slot = async |sessions: Vec<RecordedSession>| {
+        let mut sent = SendReport::default();
+        for RecordedSession { index, after, .. } in sessions {
+            let mut stopped = stopped.clone();
+            let told = async move {
+                // An error means that it is over anyway.
+                let _ = stopped.wait_for(|is_told| *is_told).await;
+            };
+            tokio::pin!(told);
+            let due = begun + Duration::from_secs_f64((after / options.speed).clamp(0.0, 1e9));
+            tokio::select! {
+                () = told.as_mut() => return Ok((Ending::Stopped, sent)),
+                () = tokio::time::sleep_until(due) => {}
+            }
+            let Ok(feed) = RecordedFeed::session(Recording::open(path)?, index, range)? else { continue };
+            let feed = Feed::new_for_any_character(feed, shown.clone())?;
+            if send_once(feed, options, progress, &mut sent, told.as_mut()).await? == Ending::Stopped {
+                return Ok((Ending::Stopped, sent));
+            }
+        }
+        Ok::<_, SendError>((Ending::Sent, sent))
+    };
+    let all = futures_util::future::try_join_all(slots.into_values().map(send_slot));
+    tokio::pin!(all);
+    let ended = tokio::select! {
+        ended = all.as_mut() => ended,
+        () = stop => {
+            stopping.send_replace(true);
+            all.await
+        }
+    };
+    let mut ending = Ending::Sent;
+    for (end, sent) in ended? {
+        report.frames += sent.frames;
+        report.errors += sent.errors;
+        if end == Ending::Stopped {
+            ending = end;
+        }
+    }
+    Ok(ending)
 }
 
 /// Why a session was closed without an error.
@@ -239,7 +291,8 @@ async fn connect(options: &SendOptions) -> Result<Socket, SendError> {
     let connecting = async {
         let mut request = url.as_str().into_client_request()?;
         request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
-        connect_async(request).await
+        let config = options.trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
+        connect_async_tls_with_config(request, None, false, Some(Connector::Rustls(config))).await
     };
     let problem = match tokio::time::timeout(options.timeout, connecting).await {
         Ok(Ok((socket, _))) => return Ok(socket),
@@ -269,12 +322,12 @@ async fn publish<R: BufRead>(
     report: &mut SendReport,
 ) -> Result<(), Unsent> {
     let within = |what: &str| Unsent::Stuck(format!("{what} within {} s", options.timeout.as_secs_f64()));
-    let mut write = async |text: String| match tokio::time::timeout(options.timeout, sink.send(Message::text(text))).await {
+    let mut write = async |message: Message| match tokio::time::timeout(options.timeout, sink.send(message)).await {
         Ok(Ok(())) => Ok(()),
         Ok(Err(_)) => Err(Unsent::Lost),
         Err(_) => Err(within("it read nothing")),
     };
-    write(hello(feed.text(), options.takeover)).await?;
+    write(Message::text(hello(feed.text(), options.takeover))).await?;
     // An error means that the listening has ended, which is told there.
     if tokio::time::timeout(options.timeout, is_ready).await.map_err(|_| within("no answer to the hello"))?.is_err() {
         return Err(Unsent::Lost);
@@ -291,10 +344,23 @@ async fn publish<R: BufRead>(
             }
             report.frames += 1;
         }
-        write(feed.text().to_owned()).await?;
+        let binary = if options.binary && item == FeedItem::Frame { binary_form(&frame, feed.text()) } else { None };
+        write(binary.unwrap_or_else(|| Message::text(feed.text()))).await?;
         progress.inc(feed.text().len() as u64 + 1);
     }
     Ok(())
+}
+
+/// A frame of landmarks in the binary form; `None` for what stays JSON: other frames, and those that also give expressions,
+/// which a sender's reader leaves out.
+fn binary_form(frame: &TrackingFrame, text: &str) -> Option<Message> {
+    let TrackingData::Landmarks { points, confidence } = &frame.data else { return None };
+    if text.contains("\"expressions\"") {
+        return None;
+    }
+    let mut bytes = Vec::new();
+    encode_landmarks(frame.t, points, confidence, &mut bytes).ok()?;
+    Some(Message::binary(bytes))
 }
 
 /// How a session came to its end.

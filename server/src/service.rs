@@ -6,7 +6,8 @@ use crate::metrics::Metrics;
 use crate::recording::{PlayError, PlayRequest, Players, RecordError, Recorder, RecorderStatus};
 use crate::room::{Room, Rooms};
 use crate::socket::{ErrorMessage, say_and_close};
-use crate::stream::TimedStream;
+use crate::stream::{TimedStream, Wire};
+use crate::tls::{self, Identity, TlsError};
 use crate::trackers::listen::{self, Port, Trackers};
 use crate::trackers::vmc_out::{self, VmcOut};
 use axum::extract::Request;
@@ -22,6 +23,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, mpsc, watch};
+use tokio_rustls::TlsAcceptor;
 use tokio_tungstenite::tungstenite::Bytes;
 use tower_service::Service as _;
 
@@ -63,6 +65,9 @@ pub enum ServerError {
     /// The recording could not be played.
     #[error(transparent)]
     Play(PlayError),
+    /// There is no certificate.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
     /// The address could not be listened on.
     #[error("cannot listen on {address}: {source}")]
     Listen {
@@ -98,7 +103,7 @@ pub(crate) struct Hub {
     pub hello_character: CharacterHello,
     pub layout: PacketLayout,
     pub rooms: Rooms,
-    pub recorder: Recorder,
+    pub recorder: Arc<Recorder>,
     pub players: Players,
     pub trackers: Trackers,
     pub metrics: Arc<Metrics>,
@@ -106,38 +111,24 @@ pub(crate) struct Hub {
     /// True once the service ends.
     pub shutdown: watch::Receiver<bool>,
     /// Every task holds the hub, so this is dropped with the last of them, for which the service waits.
-    tasks: mpsc::Sender<Infallible>,
+    _tasks: mpsc::Sender<Infallible>,
     connections: Mutex<Connections>,
     refusals: Arc<Semaphore>,
 }
 
 /// Begins a recording of `room`, which ends with the room or when it is told to. Done once its file is there.
-pub(crate) async fn record(hub: &Arc<Hub>, room: &Arc<Room>) -> Result<RecorderStatus, RecordError> {
+pub(crate) async fn record(hub: &Hub, room: &Room) -> Result<RecorderStatus, RecordError> {
     if room.is_recorded() {
         return Err(RecordError::Running);
     }
-    let (sink, made) = hub.recorder.start(&room.name, hub.tasks.clone())?;
-    room.record_into(sink, &hub.config.solve)?;
+    let (sink, made) = hub.recorder.start(&room.name, room.since())?;
+    room.record_into(sink)?;
     // A disk may take its time to make a file.
     let made = tokio::task::spawn_blocking(move || made.recv()).await;
     if let Ok(Ok(Err(error))) = made {
         return Err(error);
     }
     room.recording().ok_or(RecordError::NoFolder)
-}
-
-/// Begins the recording of a room that is recorded without being asked to, unless there is one. Waits for nothing.
-pub(crate) fn record_by_itself(hub: &Hub, room: &Arc<Room>) {
-    if !hub.recorder.is_automatic(&room.name) || room.is_recorded() {
-        return;
-    }
-    let begun = hub.recorder.start(&room.name, hub.tasks.clone()).and_then(|(sink, _)| room.record_into(sink, &hub.config.solve));
-    if let Err(error) = begun
-        && !matches!(error, RecordError::Running)
-    {
-        hub.metrics.recording_failures.inc();
-        tracing::error!(room = %room.name, %error, "the room is not recorded");
-    }
 }
 
 /// Done when the service ends.
@@ -166,11 +157,12 @@ pub async fn bind(address: &str) -> Result<TcpListener, ServerError> {
 }
 
 /// Serves a character, with the `.glb` it was read from, on `listener` until `shutdown` is done, then closes every socket with
-/// a reason.
+/// a reason. With an `identity` every connection is encrypted.
 pub async fn run(
     listener: TcpListener,
     config: ServerConfig,
     (character, glb): (Arc<Character>, Vec<u8>),
+    mut identity: Option<Identity>,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServerError> {
     config.validate()?;
@@ -188,12 +180,13 @@ pub async fn run(
     let character_url = format!("/characters/{}.glb", file_name(&character.name));
     let hello_character = ViewHello::new("", &character, character_url.clone()).character;
     let layout = PacketLayout::from(&*character);
+    let recorder = Arc::new(Recorder::new(config.record.clone(), &character, metrics.clone(), tasks.clone()));
     let hub = Arc::new(Hub {
         players: Players::default(),
-        recorder: Recorder::new(config.record.clone(), hello_character.clone(), layout.clone(), metrics.clone()),
+        rooms: Rooms::new(character.clone(), config.limits.rooms, config.limits.viewers_per_room, metrics.clone(), recorder.clone()),
+        recorder,
         hello_character,
         layout,
-        rooms: Rooms::new(config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
         trackers: Trackers::default(),
         listens_on_loopback: address.ip().is_loopback(),
         character,
@@ -201,12 +194,17 @@ pub async fn run(
         character_url,
         metrics,
         shutdown: stops,
-        tasks,
+        _tasks: tasks,
         connections: Mutex::default(),
         refusals: Arc::new(Semaphore::new(MOST_REFUSALS)),
         config,
     });
     let app = router(hub.clone());
+    // In the background: whoever watches is answered at once, and the first publisher does not wait for what all share.
+    tokio::task::spawn_blocking({
+        let hub = Arc::downgrade(&hub);
+        move || hub.upgrade().iter().for_each(|hub| crate::solve::prepare(&hub.character, &hub.config.solve))
+    });
     tracing::info!(%address, character = hub.character.name, "serving");
     if let Some(Play { file, room, request }) = hub.config.play.clone() {
         hub.players.start(&hub, &room, &file, request).map_err(ServerError::Play)?;
@@ -214,13 +212,18 @@ pub async fn run(
     listen::start(&hub, ports);
     vmc_out::start(&hub, outs);
     tokio::pin!(shutdown);
+    let acceptor = identity.as_ref().map(Identity::acceptor);
+    let mut reload = tokio::time::interval(tls::RELOAD_INTERVAL);
     let mut sweep = tokio::time::interval(SWEEP_INTERVAL.min(seconds(hub.config.timeouts.room_idle)));
     loop {
         tokio::select! {
             () = &mut shutdown => break,
             _ = sweep.tick() => hub.rooms.sweep(seconds(hub.config.timeouts.room_idle)),
+            _ = reload.tick() => if let Some(identity) = &mut identity {
+                identity.reload();
+            },
             accepted = listener.accept() => match accepted {
-                Ok((stream, peer)) => accept(&hub, stream, peer, &app),
+                Ok((stream, peer)) => accept(&hub, stream, peer, &app, acceptor.as_ref()),
                 Err(error) => {
                     tracing::warn!(%error, "cannot accept a connection");
                     tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -240,15 +243,23 @@ pub async fn run(
 }
 
 /// Serves one connection in a task of its own, unless there are too many.
-fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Router) {
+fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Router, acceptor: Option<&TlsAcceptor>) {
     prepare(&stream);
     let place = match Place::take(hub, peer.ip()) {
         Ok(place) => place,
-        Err(error) => return refuse(hub, stream, peer, &error),
+        Err(error) => return refuse(hub, stream, peer, &error, acceptor.is_some()),
     };
-    let (hub, app) = (hub.clone(), app.clone());
+    let (hub, app, acceptor) = (hub.clone(), app.clone(), acceptor.cloned());
     tokio::spawn(async move {
         let place = Arc::new(place);
+        let wire = match &acceptor {
+            None => Wire::Plain(stream),
+            // In a box of its own: what a handshake needs would stay with the task for as long as the connection lives.
+            Some(acceptor) => match Box::pin(tls::shake_hands(&hub, acceptor, stream, peer)).await {
+                Some(wire) => wire,
+                None => return,
+            },
+        };
         // Every request learns where it comes from, and a WebSocket keeps the connection's place.
         let service = hyper::service::service_fn(move |request: hyper::Request<hyper::body::Incoming>| {
             let mut request: Request = request.map(axum::body::Body::new);
@@ -260,7 +271,7 @@ fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Route
             .timer(TokioTimer::new())
             .header_read_timeout(seconds(hub.config.timeouts.hello))
             .max_buf_size(MAX_REQUEST_HEAD)
-            .serve_connection(TokioIo::new(TimedStream::new(stream, seconds(hub.config.timeouts.write))), service)
+            .serve_connection(TokioIo::new(TimedStream::new(wire, seconds(hub.config.timeouts.write))), service)
             .with_upgrades();
         tokio::pin!(connection);
         let mut shutdown = hub.shutdown.clone();
@@ -277,10 +288,14 @@ fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Route
     });
 }
 
-/// Tells a connection that there are too many, in a task of its own where there is room for one.
-fn refuse(hub: &Hub, stream: TcpStream, peer: SocketAddr, error: &ErrorMessage) {
+/// Tells a connection that there are too many, in a task of its own where there is room for one. An encrypted one is cut: a
+/// handshake costs more than the word is worth.
+fn refuse(hub: &Hub, stream: TcpStream, peer: SocketAddr, error: &ErrorMessage, is_encrypted: bool) {
     hub.metrics.end(error.code);
     tracing::debug!(%peer, message = error.message, "connection refused");
+    if is_encrypted {
+        return;
+    }
     let Ok(permit) = hub.refusals.clone().try_acquire_owned() else { return };
     let body = serde_json::to_string(error).expect("plain data can be written");
     let answer = format!(
@@ -288,7 +303,7 @@ fn refuse(hub: &Hub, stream: TcpStream, peer: SocketAddr, error: &ErrorMessage) 
         body.len()
     );
     tokio::spawn(async move {
-        say_and_close(stream, answer.as_bytes()).await;
+        say_and_close(Wire::Plain(stream), answer.as_bytes()).await;
         drop(permit);
     });
 }

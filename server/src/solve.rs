@@ -24,9 +24,11 @@ mod landmarks_to_bones;
 mod lids;
 mod linear;
 mod lower_face;
+pub mod mix;
 mod points;
 mod rbf;
 mod rotation;
+mod settings;
 mod skeleton;
 mod weight_session;
 mod weights_to_bones;
@@ -49,8 +51,9 @@ use easing::{Easing, FaceState};
 use evaluate::Evaluator;
 use landmark_session::LandmarkSession;
 use rhytid_shared::limits::{MAX_EXPRESSIONS, MAX_SECONDS};
-use rhytid_shared::{Character, FaceFrame, HeadPose, PublishHello, TrackingData, TrackingFrame};
+use rhytid_shared::{Character, FaceFrame, HeadPose, PublishHello, Settings, TrackingData, TrackingFrame};
 use serde::Serialize;
+use settings::Amplifier;
 use skeleton::Skeleton;
 use std::sync::Arc;
 use weight_session::{SentHead, WeightSession};
@@ -88,8 +91,19 @@ pub struct DelayReport {
     pub head: f64,
 }
 
+/// Makes what the sessions of a character share, which takes tens of milliseconds: a service does so before its first session
+/// comes, else that one does. The same character (by its `Arc`) is prepared once.
+pub fn prepare(character: &Arc<Character>, config: &SolveConfig) {
+    if config.estimate_weights {
+        estimate::ExpressionMap::shared(character);
+    }
+}
+
 /// Turns one publisher's tracking frames into face frames.
 pub struct Solver {
+    hello: PublishHello,
+    settings: Settings,
+    amplifier: Amplifier,
     character: Arc<Character>,
     config: SolveConfig,
     landmarks: Option<LandmarkSession>,
@@ -129,7 +143,10 @@ impl Solver {
             Some(layout) => Some(LandmarkSession::new(&character, config, layout, hello)?),
             None => None,
         };
-        Ok(Self {
+        let mut solver = Self {
+            hello: hello.clone(),
+            settings: Settings::default(),
+            amplifier: Amplifier::new(&character),
             landmarks,
             weights: WeightSession::new(&character, config),
             sent_head: SentHead::new(config.mirror),
@@ -147,7 +164,9 @@ impl Solver {
             seq: 0,
             config: config.clone(),
             character,
-        })
+        };
+        solver.set(&hello.settings)?;
+        Ok(solver)
     }
 
     /// As [`Self::new`], with a neutral from an earlier session in place of the search for one.
@@ -255,6 +274,10 @@ impl Solver {
             }
         }
         let source = self.aim_bones(frame.t, &frame.data)?;
+        // An animator's own bones are where they shall be.
+        if matches!(source, Some(Source::Landmarks | Source::Weights)) {
+            self.amplifier.amplify(&mut self.target);
+        }
         // What the publisher says of expressions counts before what weights say. Weights that are estimated lack what landmarks
         // hardly show: the bones' influences, which the same landmarks drive, say more.
         let known = match (&frame.expressions, &self.target.weights, &self.zones) {
@@ -341,8 +364,8 @@ impl Solver {
         match (&self.landmarks, self.last_source) {
             (Some(landmarks), Some(Source::Landmarks) | None) => landmarks.added_delay(),
             (_, Some(Source::Weights)) => {
-                let delay = self.weights.added_delay();
-                DelayReport { brows: delay, eyelids: delay, mouth: delay, head: 0.0 }
+                let [brows, eyelids, mouth] = self.weights.added_delays();
+                DelayReport { brows, eyelids, mouth, head: 0.0 }
             }
             _ => DelayReport::default(),
         }

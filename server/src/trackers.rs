@@ -163,6 +163,12 @@ pub enum Refusal {
     /// Of no protocol that is spoken here.
     #[error("it is of no known protocol")]
     UnknownProtocol,
+    /// There are as many senders as a port has places for.
+    #[error("there are too many senders")]
+    TooManySenders,
+    /// Not newer than what has come before.
+    #[error("it comes too late")]
+    Late,
     /// Belongs to no session.
     #[error("it belongs to no session")]
     NoSession,
@@ -182,6 +188,8 @@ impl Refusal {
             Self::OutOfRange => "out_of_range",
             Self::NoContent => "no_content",
             Self::UnknownProtocol => "unknown_protocol",
+            Self::TooManySenders => "too_many_performers",
+            Self::Late => "late",
             Self::NoSession => "no_session",
         }
     }

@@ -12,12 +12,17 @@ pub mod packet;
 #[cfg(test)]
 mod testing;
 mod tracking;
+#[cfg(feature = "trust")]
+pub mod trust;
 pub mod view;
 
 pub use character::{Character, CharacterError};
 pub use face::{FaceFrame, HeadPose};
 pub use names::{ARKIT_NAMES, ArkitShape, NUM_ARKIT_SHAPES, NameError, RoomName};
-pub use tracking::{MessageError, PublishHello, PublishMessage, PublishReader, TrackingData, TrackingFrame};
+pub use tracking::{
+    ChannelGroup, ChannelGroups, GroupValues, MessageError, PublishHello, PublishMessage, PublishReader, Settings, Slot, TrackingData,
+    TrackingFrame, encode_landmarks,
+};
 
 /// The default character (CC0, see the file's `asset.copyright`), as `cargo xtask bake` made it.
 pub const DEFAULT_CHARACTER_GLB: &[u8] = include_bytes!("../assets/default.glb");

@@ -1,7 +1,10 @@
 //! What a tracker publishes: the checked messages, and the reader that turns their JSON into them.
 
+mod binary;
 mod fields;
 mod reader;
+mod settings;
+mod slot;
 
 use crate::face::HeadPose;
 use crate::layout::Layout;
@@ -9,7 +12,10 @@ use crate::limits::MAX_EXPRESSIONS;
 use crate::names::NUM_ARKIT_SHAPES;
 use glam::Vec3;
 
+pub use binary::encode_landmarks;
 pub use reader::PublishReader;
+pub use settings::{GroupValues, Settings};
+pub use slot::{ChannelGroup, ChannelGroups, Slot};
 
 /// A publisher's first message, checked. By default one of an unnamed sender of weights or bones.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -25,8 +31,12 @@ pub struct PublishHello {
     /// Focal length of the tracker's camera, pixels; the image width serves where it is unknown. With an image within
     /// [`FOCAL_RANGE`](crate::limits::FOCAL_RANGE) of its width.
     pub focal: Option<f32>,
-    /// Take the room over from another publisher.
+    /// Take the slot over from another publisher.
     pub takeover: bool,
+    /// The source slot that it claims.
+    pub slot: Slot,
+    /// Settings to start with.
+    pub settings: Settings,
     /// Start from the neutral face that the room keeps of the same tracker, see [`Self::is_of_same_tracker`].
     pub keep_neutral: bool,
 }
@@ -101,6 +111,10 @@ pub enum PublishMessage {
     Frame,
     /// Take the neutral face now.
     Calibrate,
+    /// Change some settings.
+    Settings(Settings),
+    /// The head's present pose is straight ahead.
+    Recentre,
 }
 
 /// Why a publish message was refused. `message` names the field and what was expected.

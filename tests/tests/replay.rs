@@ -30,6 +30,7 @@ fn replay(config: &SolveConfig) -> Replay {
     while let Some(item) = feed.next_frame(&mut frame).expect("the demo session has no bad line") {
         match item {
             FeedItem::Calibrate => pipeline.calibrate(),
+            FeedItem::Settings(_) | FeedItem::Recentre => panic!("the demo session sets nothing"),
             FeedItem::Frame => {
                 let kind = pipeline.frame(&frame, &mut packet).expect("every frame is solved");
                 hash.update((packet.len() as u64).to_le_bytes());

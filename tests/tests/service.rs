@@ -10,4 +10,6 @@ mod service {
     pub mod neutral;
     pub mod rooms;
     pub mod sending;
+    pub mod slots;
+    pub mod tls;
 }

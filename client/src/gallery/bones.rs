@@ -68,8 +68,15 @@ pub(super) fn tracker(easel: &mut Easel) -> Result<Sheet> {
     let mut solved = FaceFrame::at_rest(&character);
     let mut moments: Vec<Moment> = Vec::new();
     while let Some(item) = feed.next_frame(&mut tracked)? {
-        if item == FeedItem::Calibrate {
-            solver.calibrate();
+        match item {
+            FeedItem::Frame => {}
+            FeedItem::Calibrate => solver.calibrate(),
+            FeedItem::Settings(change) => solver.set(&change)?,
+            FeedItem::Recentre => {
+                solver.recentre();
+            }
+        }
+        if item != FeedItem::Frame {
             continue;
         }
         solver.solve(&tracked, &mut solved).map_err(|source| PictureError::Frame {

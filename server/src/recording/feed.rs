@@ -1,15 +1,31 @@
-//! A recording as a feed: the messages of one of its sessions, one a line.
+//! A recording as a feed: the messages of one of its sessions, one a line, binary ones as the text that says the same.
 
 use super::format::{Entry, SessionEvent, Topic};
 use super::reader::{ReadError, Recording};
-use std::collections::VecDeque;
+use super::text;
+use rhytid_shared::{PublishReader, TrackingFrame};
+use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, BufRead, Read};
 use std::path::Path;
 
-/// Reads the text messages of one session of a recording as the lines of a feed file.
+/// A session of a recording.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordedSession {
+    /// Its place among those that were recorded from their beginning, from 0.
+    pub index: usize,
+    /// Its slot.
+    pub slot: String,
+    /// When it began, seconds since the beginning of what is asked for; 0 where it had begun before that.
+    pub after: f64,
+}
+
+/// Reads the messages of one session of a recording as the lines of a feed file.
 pub struct RecordedFeed {
     recording: Recording,
     slot: String,
+    /// Reads binary messages, which a feed has as text.
+    reader: PublishReader,
+    frame: TrackingFrame,
     chunk: usize,
     waiting: VecDeque<Vec<u8>>,
     line: Vec<u8>,
@@ -29,6 +45,42 @@ impl RecordedFeed {
         }
     }
 
+    /// The sessions of `recording` that were recorded from their beginning and have messages from `range[0]` to `range[1]`, seconds since
+    /// the recording began.
+    pub fn sessions(recording: &mut Recording, range: [f64; 2]) -> Result<Vec<RecordedSession>, ReadError> {
+        let begin = recording.start();
+        let range = range.map(|seconds| begin.saturating_add((seconds.clamp(0.0, 9e9) * 1e9) as u64));
+        let mut sessions: Vec<RecordedSession> = Vec::new();
+        // By slot, the session that its messages are of.
+        let mut current: BTreeMap<String, Option<usize>> = BTreeMap::new();
+        let mut has_messages = Vec::new();
+        for chunk in 0..recording.chunks().len() {
+            for entry in recording.read_chunk(chunk)? {
+                match &entry.topic {
+                    Topic::Session => {
+                        let Some(SessionEvent::Start { slot, under_way, .. }) = event(&entry) else { continue };
+                        current.insert(slot.clone(), (!under_way).then_some(sessions.len()));
+                        if !under_way {
+                            let after = entry.log_time.saturating_sub(range[0]) as f64 / 1e9;
+                            sessions.push(RecordedSession { index: sessions.len(), slot, after });
+                            has_messages.push(0);
+                        }
+                    }
+                    Topic::Text(slot) | Topic::Binary(slot) => {
+                        if let Some(index) = current.get(slot).copied().flatten() {
+                            // Its hello is sent wherever it stands.
+                            let counts = has_messages[index] == 0 || (range[0]..=range[1]).contains(&entry.log_time);
+                            has_messages[index] += u32::from(counts);
+                        }
+                    }
+                    _ => {}
+                }
+            }
+        }
+        sessions.retain(|session| has_messages[session.index] > 1);
+        Ok(sessions)
+    }
+
     /// Session `index` (from 0) of those that were recorded from their beginning: its hello and its messages from `range[0]` to
     /// `range[1]`, seconds since the recording began. Gives the recording back where there are not so many.
     pub fn session(mut recording: Recording, index: usize, range: [f64; 2]) -> Result<Result<Self, Recording>, ReadError> {
@@ -44,7 +96,8 @@ impl RecordedFeed {
                     continue;
                 }
                 let (waiting, line, is_over) = (VecDeque::new(), Vec::new(), false);
-                let mut feed = Self { recording, slot, chunk: chunk + 1, waiting, line, at: 0, is_over, range };
+                let (reader, frame) = (PublishReader::for_any_character(), TrackingFrame::default());
+                let mut feed = Self { recording, slot, reader, frame, chunk: chunk + 1, waiting, line, at: 0, is_over, range };
                 feed.gather(&entries[at + 1..], true);
                 return Ok(Ok(feed));
             }
@@ -58,6 +111,11 @@ impl RecordedFeed {
         for entry in entries {
             match &entry.topic {
                 Topic::Text(slot) if *slot == self.slot => {
+                    if wants_hello {
+                        // Whoever reads the feed says what is wrong with it.
+                        let text = std::str::from_utf8(&entry.data).unwrap_or_default();
+                        let _ = self.reader.read(text, &mut self.frame);
+                    }
                     if wants_hello || (self.range[0]..=self.range[1]).contains(&entry.log_time) {
                         // Line ends are blanks in JSON.
                         let mut line: Vec<u8> =
@@ -66,6 +124,13 @@ impl RecordedFeed {
                         self.waiting.push_back(line);
                     }
                     wants_hello = false;
+                    self.is_over |= entry.log_time > self.range[1];
+                }
+                Topic::Binary(slot) if *slot == self.slot => {
+                    let is_wanted = (self.range[0]..=self.range[1]).contains(&entry.log_time);
+                    if is_wanted && self.reader.read_binary(&entry.data, &mut self.frame).is_ok() {
+                        self.waiting.push_back((text::of_frame(&self.frame) + "\n").into_bytes());
+                    }
                     self.is_over |= entry.log_time > self.range[1];
                 }
                 // The next session of this slot.

@@ -4,14 +4,15 @@
 //!
 //! ```text
 //! /session            JSON, one `SessionEvent` a message: the recording's first message, and whatever the server put in
-//! /publish/SLOT       a publisher's messages that the server took, verbatim: JSON text (hello, frames, calibrate, …)
+//! /publish/SLOT       a publisher's messages that the server took, verbatim: JSON text (hello, frames, calibrate, settings, …)
 //! /publish/SLOT/bin   the same for binary messages
 //! /refused/SLOT       messages that the server refused, verbatim, text or not: they moved nothing
 //! /packets            the packets that went out, in batches (`rhytid_shared::packet::BatchWriter`), each up to a second
 //! ```
 //! A message's `log_time` is when it reached the server (Unix clock, ns, never going back within a file; of a batch, its first
 //! packet's), its `publish_time` the sender's `t` in ns where it has one. Messages of all channels stand in the order in which
-//! the server took them, save that a batch of packets follows the messages they were made of.
+//! the server took them, which is that in which a room's sources were merged, save that a batch of packets follows the messages
+//! they were made of.
 
 use crate::solve::{Calibration, SolveConfig};
 use rhytid_shared::view::CharacterHello;
@@ -104,10 +105,13 @@ pub enum SessionEvent {
         room: String,
         /// Version of the program that wrote it.
         server: String,
-        /// The character, as viewers learn it: all that is needed to read packets. `url` is where the server had it.
+        /// The character, as viewers learn it: all that is needed to read packets. Its `url` counts for nothing here.
         character: Box<CharacterHello>,
+        /// Of `log_time`, what is 0 on the clock by which the room merges its sources, ns; 0 in a viewer's recording.
+        #[serde(default)]
+        clock: u64,
     },
-    /// A publisher has claimed its place. Its hello follows as its first message.
+    /// A publisher has claimed its slot. Its hello follows as its first message.
     Start {
         /// Number of the session in its room, as packets carry it.
         session: u32,
@@ -115,12 +119,12 @@ pub enum SessionEvent {
         slot: String,
         /// What it calls itself.
         source: String,
-        /// True where it had begun before the recording: what came before is not there, so it cannot be solved again.
+        /// True where it cannot be solved again: it had begun before the recording, or it plays a recording itself.
         under_way: bool,
         /// The neutral face that the session began with, where the room had kept one.
         kept_neutral: Option<Box<Calibration>>,
-        /// Settings of the solve.
-        solve: Box<SolveConfig>,
+        /// The server's settings of the solve; nothing where it cannot be solved again.
+        solve: Option<Box<SolveConfig>>,
     },
     /// A session has come to a neutral face.
     Neutral {

@@ -2,11 +2,12 @@
 //! speed. Every jump begins a new session, because a session's time does not go back.
 
 use super::faces::{Faces, Moment};
+use super::format::SessionEvent;
 use super::reader::{ReadError, Recording};
-use crate::room::{Evicted, Publishing, RoomError};
+use super::writer::Item;
+use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
 use rhytid_shared::RoomName;
-use rhytid_shared::packet::Encoder;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -248,7 +249,13 @@ struct Seat {
 
 impl Seat {
     fn take(hub: &Hub, room: &RoomName, source: &str, takeover: bool) -> Result<Self, RoomError> {
-        let (place, evicted) = hub.rooms.claim(room, source, takeover)?;
+        let claim = SlotClaim { source: source.to_owned(), takeover, ..SlotClaim::default() };
+        let recorded = |session| {
+            let (slot, source) = (claim.slot.name.clone(), claim.source.clone());
+            // Its packets are recorded, and no messages that they could be solved from.
+            vec![Item::Event(SessionEvent::Start { session, slot, source, under_way: true, kept_neutral: None, solve: None })]
+        };
+        let (place, evicted) = hub.rooms.claim(room, claim.clone(), recorded)?;
         Ok(Self { place, evicted })
     }
 }
@@ -259,8 +266,6 @@ struct Player<'a> {
     source: String,
     faces: Faces,
     seat: Seat,
-    encoder: Encoder,
-    packet: Vec<u8>,
     num_frames: u32,
     status: PlayStatus,
     /// The next face's time; it stands in the reader.
@@ -284,8 +289,6 @@ impl<'a> Player<'a> {
             shown: faces.frame().clone(),
             faces,
             seat,
-            encoder: Encoder::new(hub.layout.clone()),
-            packet: Vec::new(),
             num_frames: 0,
             next: None,
             anchor: (status.position, now),
@@ -391,7 +394,6 @@ impl<'a> Player<'a> {
         }
         if let Ok(seat) = Seat::take(self.hub, &self.room, &self.source, true) {
             self.seat = seat;
-            self.encoder = Encoder::new(self.hub.layout.clone());
             self.num_frames = 0;
             (self.begun, self.last_micros) = (Instant::now(), None);
         }
@@ -421,8 +423,7 @@ impl<'a> Player<'a> {
         self.shown.seq = self.num_frames;
         self.shown.captured_at_micros = micros;
         self.num_frames = self.num_frames.wrapping_add(1);
-        let kind = self.encoder.encode(&self.shown, &mut self.packet);
         // An eviction is noticed by the loop.
-        self.seat.place.publish(kind, &self.packet, &self.shown, None);
+        self.seat.place.publish(&self.shown, None);
     }
 }

@@ -68,6 +68,7 @@ pub struct Recording {
     server: String,
     character: CharacterHello,
     layout: PacketLayout,
+    clock: u64,
     /// Where whole chunks end, if the file was not finished.
     cut_at: Option<u64>,
 }
@@ -122,9 +123,9 @@ impl Recording {
         let first = first.filter(|first| first.topic == Topic::Session);
         let first = first.ok_or_else(|| broken(format!("its first message is none of a {PROFILE} recording")))?;
         match serde_json::from_slice(&first.data) {
-            Ok(SessionEvent::Recording { version: VERSION, room, server, character }) => {
+            Ok(SessionEvent::Recording { version: VERSION, room, server, character, clock }) => {
                 let layout = PacketLayout::try_from(&*character).map_err(|error: PacketError| broken(error.to_string()))?;
-                Ok(Self { file, path, length, chunks, channels, room, server, character: *character, layout, cut_at })
+                Ok(Self { file, path, length, chunks, channels, room, server, character: *character, layout, clock, cut_at })
             }
             Ok(SessionEvent::Recording { version, .. }) => Err(broken(format!("it is of version {version}, expected {VERSION}"))),
             Ok(_) => Err(broken("its first message says nothing about it".into())),
@@ -155,6 +156,11 @@ impl Recording {
     /// What is needed to read packets.
     pub fn layout(&self) -> &PacketLayout {
         &self.layout
+    }
+
+    /// The room's clock at `log_time`, ns: by which its sources were merged.
+    pub(super) fn room_nanos(&self, log_time: u64) -> u64 {
+        log_time.saturating_sub(self.clock)
     }
 
     /// Chunks in their order.

@@ -2,7 +2,7 @@
 
 use rhytid_shared::layout::Layout;
 use rhytid_shared::view::PROTOCOL_VERSION;
-use rhytid_shared::{ARKIT_NAMES, HeadPose, PublishHello, TrackingData, TrackingFrame};
+use rhytid_shared::{ARKIT_NAMES, ChannelGroup, HeadPose, PublishHello, Settings, Slot, TrackingData, TrackingFrame};
 use serde_json::{Map, Value, json};
 
 /// The text of a hello.
@@ -23,6 +23,14 @@ pub(crate) fn of_hello(hello: &PublishHello) -> String {
     }
     if let Some(focal) = hello.focal {
         fields["focal"] = json!(focal);
+    }
+    let Slot { name, priority, groups } = &hello.slot;
+    if hello.slot != Slot::default() {
+        (fields["slot"], fields["priority"]) = (json!(name), json!(priority));
+        fields["groups"] = groups.iter().map(ChannelGroup::name).collect();
+    }
+    if hello.settings != Settings::default() {
+        fields["settings"] = json!(hello.settings);
     }
     fields.to_string()
 }

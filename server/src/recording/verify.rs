@@ -3,8 +3,10 @@
 use super::format::{Entry, SessionEvent, Topic};
 use super::reader::{ReadError, Recording};
 use crate::pipeline::Pipeline;
+use crate::room::mixer_time;
+use crate::solve::mix::Mixer;
 use crate::solve::{Calibration, SolveConfig};
-use rhytid_shared::packet::{BatchReader, Decoder};
+use rhytid_shared::packet::{BatchReader, Decoder, Encoder};
 use rhytid_shared::view::CharacterHello;
 use rhytid_shared::{ARKIT_NAMES, Character, FaceFrame, PublishMessage, PublishReader, TrackingFrame};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -106,7 +108,7 @@ pub struct VerifyReport {
     pub sessions: u32,
     /// Frames that gave the recorded bytes.
     pub frames: u64,
-    /// Packets of sessions that had begun before the recording.
+    /// Packets of sessions that had begun before the recording, or that play one.
     pub not_compared: u64,
     /// Frames at the end whose packets are not there: the recording was cut.
     pub cut: u64,
@@ -128,13 +130,15 @@ pub fn verify(recording: &mut Recording, character: &Arc<Character>) -> Result<V
         start: recording.start(),
         character,
         slots: BTreeMap::new(),
-        solved: BTreeMap::new(),
+        merging: Merging::new(character),
+        blind: BTreeSet::new(),
+        first: None,
+        solved: VecDeque::new(),
         batches: BatchReader::new(recording.layout().clone()),
         recorded_stream: Stream::new(character),
         solved_stream: Stream::new(character),
         report: VerifyReport::default(),
         frame: TrackingFrame::default(),
-        ended: BTreeSet::new(),
     };
     let is_cut = recording.cut_off().is_some();
     for index in 0..recording.chunks().len() {
@@ -155,41 +159,52 @@ struct Solving {
     pipeline: Option<Pipeline>,
 }
 
+/// What a room does with the faces of its sources.
+struct Merging {
+    mixer: Mixer,
+    last_session: u32,
+    encoder: Encoder,
+    encoded_session: u32,
+}
+
+impl Merging {
+    /// As a room is before its first source, or after the last one has left.
+    fn new(character: &Arc<Character>) -> Self {
+        Self { mixer: Mixer::new(character.clone()), last_session: 0, encoder: Encoder::new(&**character), encoded_session: 0 }
+    }
+}
+
 struct Run<'a> {
     names: CharacterHello,
     start: u64,
     character: &'a Arc<Character>,
     /// By slot.
     slots: BTreeMap<String, Solving>,
-    /// Packets that were solved and not compared yet, by session.
-    solved: BTreeMap<u32, VecDeque<Vec<u8>>>,
+    merging: Merging,
+    /// Sessions that are there and cannot be solved again, or are merged with such; while there are any, nothing is solved.
+    blind: BTreeSet<u32>,
+    /// Packets of sessions before this one went out while nothing could be solved.
+    first: Option<u32>,
+    /// Packets that were solved and not compared yet.
+    solved: VecDeque<Vec<u8>>,
     batches: BatchReader,
     recorded_stream: Stream,
     solved_stream: Stream,
     report: VerifyReport,
     frame: TrackingFrame,
-    /// Sessions whose end is recorded.
-    ended: BTreeSet<u32>,
 }
 
 impl Run<'_> {
     fn take(&mut self, recording: &Recording, entry: &Entry) -> Result<(), VerifyError> {
         match &entry.topic {
             Topic::Session => self.event(recording, entry),
-            Topic::Text(slot) => self.message(slot, entry),
+            Topic::Text(slot) | Topic::Binary(slot) => self.message(recording, slot, entry),
             Topic::Packets => {
                 let mut packets = Vec::new();
                 let read = self.batches.unpack(&entry.data, |_, packet| packets.push(packet.to_vec()));
                 read.map_err(|error| recording.broken_batch(entry.log_time, &error))?;
                 packets.iter().try_for_each(|packet| self.compare(packet))
             }
-            Topic::Binary(slot) => match self.slots.get(slot) {
-                Some(Solving { session, .. }) => {
-                    let problem = "it is binary, which this version does not read".to_owned();
-                    Err(VerifyError::Refused { session: *session, seconds: self.seconds(entry), problem })
-                }
-                None => Ok(()),
-            },
             Topic::Refused(_) => Ok(()),
         }
     }
@@ -197,21 +212,37 @@ impl Run<'_> {
     fn event(&mut self, recording: &Recording, entry: &Entry) -> Result<(), VerifyError> {
         let event = serde_json::from_slice(&entry.data).map_err(|error| recording.broken(format!("a session event: {error}")))?;
         match event {
-            SessionEvent::Start { session, slot, under_way: false, kept_neutral, solve, .. } => {
+            SessionEvent::Start { session, slot, under_way: false, kept_neutral, solve: Some(config), .. } if self.blind.is_empty() => {
                 let reader = PublishReader::new(self.character);
-                self.solved.insert(session, VecDeque::new());
-                self.slots.insert(slot, Solving { session, config: solve, kept: kept_neutral, reader, pipeline: None });
+                if self.slots.is_empty() {
+                    self.first.get_or_insert(session);
+                }
+                self.merging.last_session = session;
+                let solving = Solving { session, config, kept: kept_neutral, reader, pipeline: None };
+                if let Some(before) = self.slots.insert(slot, solving) {
+                    // Its end should have been said.
+                    self.merging.mixer.leave(before.session);
+                }
             }
-            SessionEvent::Start { slot, session, under_way: true, .. } => {
-                self.slots.remove(&slot);
-                self.solved.remove(&session);
+            SessionEvent::Start { session, .. } => {
+                let others = std::mem::take(&mut self.slots);
+                self.blind.extend(others.into_values().map(|solving| solving.session));
+                self.blind.insert(session);
+            }
+            SessionEvent::End { session, .. } => {
+                if self.blind.remove(&session) {
+                    if self.blind.is_empty() {
+                        // The next source finds the room as new.
+                        (self.merging, self.first) = (Merging::new(self.character), None);
+                    }
+                } else {
+                    self.slots.retain(|_, solving| solving.session != session);
+                    self.merging.mixer.leave(session);
+                }
             }
             SessionEvent::Gap { messages } => {
                 let (seconds, frames) = (self.seconds(entry), self.report.frames);
                 return Err(VerifyError::Gap { seconds, messages, frames });
-            }
-            SessionEvent::End { session, .. } => {
-                self.ended.insert(session);
             }
             _ => {}
         }
@@ -222,71 +253,98 @@ impl Run<'_> {
         entry.log_time.saturating_sub(self.start) as f64 / 1e9
     }
 
-    fn message(&mut self, slot: &str, entry: &Entry) -> Result<(), VerifyError> {
+    fn message(&mut self, recording: &Recording, slot: &str, entry: &Entry) -> Result<(), VerifyError> {
         let seconds = self.seconds(entry);
         let Some(solving) = self.slots.get_mut(slot) else { return Ok(()) };
         let session = solving.session;
         let refused = |problem: String| VerifyError::Refused { session, seconds, problem };
-        let text = std::str::from_utf8(&entry.data).map_err(|error| refused(error.to_string()))?;
-        match (solving.reader.read(text, &mut self.frame).map_err(|error| refused(error.message))?, &mut solving.pipeline) {
-            (PublishMessage::Hello(hello), None) => {
-                let character = self.character.clone();
-                let pipeline = match solving.kept.take() {
-                    Some(kept) => Pipeline::with_calibration(character, &solving.config, &hello, session, *kept),
-                    None => Pipeline::new(character, &solving.config, &hello, session),
-                };
-                solving.pipeline = Some(pipeline.map_err(|error| refused(error.to_string()))?);
-                self.report.sessions += 1;
-            }
-            (PublishMessage::Frame, Some(pipeline)) => {
-                let mut packet = Vec::new();
-                pipeline.frame(&self.frame, &mut packet).map_err(|error| refused(error.to_string()))?;
-                let solved = self.solved.entry(session).or_default();
-                if solved.len() >= MAX_AHEAD {
-                    return Err(VerifyError::Unmatched { session, seq: pipeline.face().seq, problem: "no packets follow the messages" });
+        let read = if matches!(entry.topic, Topic::Binary(_)) {
+            solving.reader.read_binary(&entry.data, &mut self.frame)
+        } else {
+            let text = std::str::from_utf8(&entry.data).map_err(|error| refused(error.to_string()))?;
+            solving.reader.read(text, &mut self.frame)
+        };
+        let message = read.map_err(|error| refused(error.message))?;
+        let Some(pipeline) = &mut solving.pipeline else {
+            let PublishMessage::Hello(hello) = message else { return Err(refused("expected a hello first".into())) };
+            let character = self.character.clone();
+            let pipeline = match solving.kept.take() {
+                Some(kept) => Pipeline::with_calibration(character, &solving.config, &hello, session, *kept),
+                None => Pipeline::new(character, &solving.config, &hello, session),
+            };
+            solving.pipeline = Some(pipeline.map_err(|error| refused(error.to_string()))?);
+            self.merging.mixer.enter(session, &hello.slot);
+            self.report.sessions += 1;
+            return Ok(());
+        };
+        match message {
+            PublishMessage::Frame => {
+                pipeline.solve(&self.frame).map_err(|error| refused(error.to_string()))?;
+                let Merging { mixer, last_session, encoder, encoded_session } = &mut self.merging;
+                let now = mixer_time(recording.room_nanos(entry.log_time));
+                let Some(merged) = mixer.take(session, pipeline.face(), now, last_session) else { return Ok(()) };
+                if merged.session != *encoded_session {
+                    *encoder = Encoder::new(&**self.character);
+                    *encoded_session = merged.session;
                 }
-                solved.push_back(packet);
+                let mut packet = Vec::new();
+                encoder.encode(merged, &mut packet);
+                if self.solved.len() >= MAX_AHEAD {
+                    let (session, seq) = (merged.session, merged.seq);
+                    return Err(VerifyError::Unmatched { session, seq, problem: "no packets follow the messages" });
+                }
+                self.solved.push_back(packet);
             }
-            (PublishMessage::Calibrate, Some(pipeline)) => pipeline.calibrate(),
-            (PublishMessage::Hello(_) | PublishMessage::Frame | PublishMessage::Calibrate, _) => {
-                return Err(refused("expected one hello, and it first".into()));
+            PublishMessage::Calibrate => pipeline.calibrate(),
+            PublishMessage::Settings(change) => pipeline.set(&change).map_err(|error| refused(error.to_string()))?,
+            PublishMessage::Recentre => {
+                if !pipeline.recentre() {
+                    return Err(refused("no face has been seen yet, expected one to re-centre".into()));
+                }
             }
+            PublishMessage::Hello(_) => return Err(refused("expected one hello".into())),
         }
         Ok(())
     }
 
     fn compare(&mut self, recorded: &[u8]) -> Result<(), VerifyError> {
-        let Some(was) = self.recorded_stream.take(recorded) else {
-            // A session that was under way may begin with what cannot be read.
+        let was = self.recorded_stream.take(recorded);
+        let (session, seq) = was.map_or((0, 0), |frame| (frame.session, frame.seq));
+        let is_expected = was.is_some() && self.blind.is_empty() && self.first.is_some_and(|first| session >= first);
+        let Some(solved) = self.solved.pop_front() else {
+            if is_expected {
+                return Err(VerifyError::Unmatched { session, seq, problem: "a packet went out that no message gives" });
+            }
+            // From a time that cannot be solved again; the first of those may not even be read.
             self.report.not_compared += 1;
             return Ok(());
-        };
-        let (session, seq) = (was.session, was.seq);
-        let Some(solved) = self.solved.get_mut(&session) else {
-            self.report.not_compared += 1;
-            return Ok(());
-        };
-        let Some(solved) = solved.pop_front() else {
-            return Err(VerifyError::Unmatched { session, seq, problem: "a packet went out that no message gives" });
         };
         let is = self.solved_stream.take(&solved).expect("a packet just written can be read");
         if solved == recorded {
             self.report.frames += 1;
             return Ok(());
         }
+        let Some(was) = was else {
+            return Err(VerifyError::Unmatched { session: is.session, seq: is.seq, problem: "its packet cannot be read" });
+        };
+        if self.first.is_some_and(|first| was.session < first) {
+            // What still went out from before.
+            self.solved.push_front(solved);
+            self.report.not_compared += 1;
+            return Ok(());
+        }
         Err(VerifyError::Different(Box::new(difference(was, is, &self.names))))
     }
 
     fn end(mut self, is_cut: bool) -> Result<VerifyReport, VerifyError> {
-        for (session, solved) in &self.solved {
-            self.report.cut += solved.len() as u64;
-            if !is_cut
-                && self.ended.contains(session)
-                && let Some(packet) = solved.front()
-            {
-                let seq = self.solved_stream.take(packet).map_or(0, |frame| frame.seq);
-                return Err(VerifyError::Unmatched { session: *session, seq, problem: "a message gives a packet that did not go out" });
-            }
+        self.report.cut = self.solved.len() as u64;
+        let is_over = self.slots.is_empty() && self.blind.is_empty();
+        if !is_cut
+            && is_over
+            && let Some(packet) = self.solved.front()
+        {
+            let (session, seq) = self.solved_stream.take(packet).map_or((0, 0), |frame| (frame.session, frame.seq));
+            return Err(VerifyError::Unmatched { session, seq, problem: "a message gives a packet that did not go out" });
         }
         match self.report {
             VerifyReport { frames: 0, not_compared: 0, .. } => Err(VerifyError::Nothing("it has no packets")),

@@ -5,16 +5,17 @@ use super::writer::{RecordError, RecordingWriter};
 use futures_util::StreamExt;
 use mcap::McapError;
 use rhytid_shared::packet::PacketLayout;
+use rhytid_shared::trust::Trust;
 use rhytid_shared::view::{SUBPROTOCOL, ViewMessage};
 use std::fs::{File, OpenOptions};
 use std::future::Future;
 use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use tokio_tungstenite::connect_async_with_config;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::http::{HeaderValue, header};
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{self, Message};
+use tokio_tungstenite::{Connector, connect_async_tls_with_config};
 
 /// Largest message: the hello of 64 bones and 8 poses takes about 60 KB.
 const MAX_MESSAGE: usize = 1 << 20;
@@ -44,16 +45,17 @@ pub enum WatchError {
     },
 }
 
-/// Records `room` of `server` (e.g. `ws://127.0.0.1:7878`) into a new file at `out` until `stop` is done or the server closes; gives the
+/// Records `room` of `server` (e.g. `ws://127.0.0.1:7878`; `wss://` where `trust` says so) into a new file at `out` until `stop` is done or the server closes; gives the
 /// number of packets and of bytes.
-pub async fn watch(server: &str, room: &str, out: &Path, stop: impl Future<Output = ()>) -> Result<(u64, u64), WatchError> {
+pub async fn watch(server: &str, room: &str, trust: &Trust, out: &Path, stop: impl Future<Output = ()>) -> Result<(u64, u64), WatchError> {
     let url = format!("{}/v1/rooms/{room}/view", server.trim_end_matches('/'));
     let failed = |problem: String| WatchError::Server { url: url.clone(), problem };
     let connecting = async {
         let mut request = url.as_str().into_client_request()?;
         request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
         let config = WebSocketConfig::default().max_message_size(Some(MAX_MESSAGE)).max_frame_size(Some(MAX_MESSAGE));
-        let (mut socket, _) = connect_async_with_config(request, Some(config), true).await?;
+        let tls = trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
+        let (mut socket, _) = connect_async_tls_with_config(request, Some(config), true, Some(Connector::Rustls(tls))).await?;
         loop {
             match socket.next().await {
                 Some(Ok(Message::Text(text))) => return Ok((socket, text)),
@@ -83,6 +85,7 @@ pub async fn watch(server: &str, room: &str, out: &Path, stop: impl Future<Outpu
         room: room.to_owned(),
         server: env!("CARGO_PKG_VERSION").into(),
         character: Box::new(hello.character),
+        clock: 0,
     };
     writer.event(now(), &begin).map_err(|error: McapError| write_error(&error))?;
     let mut num_packets = 0;

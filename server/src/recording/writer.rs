@@ -12,9 +12,9 @@ use crate::metrics::Metrics;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
 use mcap::{Compression, McapError, WriteOptions, Writer};
-use rhytid_shared::RoomName;
 use rhytid_shared::packet::{BatchWriter, MAX_BATCH, PacketKind, PacketLayout};
-use rhytid_shared::view::CharacterHello;
+use rhytid_shared::view::{CharacterHello, ViewHello};
+use rhytid_shared::{Character, RoomName};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -113,7 +113,6 @@ pub(crate) enum Item {
         text: Utf8Bytes,
     },
     /// A binary message that was taken.
-    #[allow(dead_code, reason = "publishers may not send any yet; the format has a place for them")]
     Binary {
         slot: Arc<str>,
         t: Option<f64>,
@@ -161,11 +160,16 @@ pub(crate) struct Recorder {
     layout: PacketLayout,
     metrics: Arc<Metrics>,
     num_running: Arc<AtomicUsize>,
+    /// The service waits for whoever holds one.
+    tasks: mpsc::Sender<Infallible>,
 }
 
 impl Recorder {
-    pub fn new(config: RecordConfig, character: CharacterHello, layout: PacketLayout, metrics: Arc<Metrics>) -> Self {
-        Self { config, character, layout, metrics, num_running: Arc::default() }
+    /// `url` of the character's file is none here: a recording outlives it.
+    pub fn new(config: RecordConfig, character: &Character, metrics: Arc<Metrics>, tasks: mpsc::Sender<Infallible>) -> Self {
+        let layout = PacketLayout::from(character);
+        let character = ViewHello::new("", character, String::new()).character;
+        Self { config, character, layout, metrics, num_running: Arc::default(), tasks }
     }
 
     /// The folder of recordings.
@@ -177,20 +181,24 @@ impl Recorder {
         self.config.is_automatic(room)
     }
 
-    /// Begins a recording of `room`; the file is made by a thread of its own, which tells once that is done.
-    pub fn start(&self, room: &RoomName, keeps: mpsc::Sender<Infallible>) -> Result<(Arc<Sink>, Made), RecordError> {
+    /// Begins a recording of `room`, whose clock counts from `since`; the file is made by a thread of its own, which tells once that is
+    /// done.
+    pub fn start(&self, room: &RoomName, since: Instant) -> Result<(Arc<Sink>, Made), RecordError> {
         let dir = self.config.dir.clone().ok_or(RecordError::NoFolder)?;
         let place = Running::take(&self.num_running, self.config.recordings, &self.metrics)?;
         let (queue, items) = sync_channel(QUEUE);
         let (made, is_made) = sync_channel(1);
         let shared = Arc::new(Shared::default());
-        let started = Clock::now();
-        let sink = Sink { started, queue, shared: shared.clone(), metrics: self.metrics.clone() };
+        let (started, unix_nanos) = (Instant::now(), unix_nanos());
+        let clock = unix_nanos.saturating_sub(nanos(started - since));
+        let sink = Sink { started, clock, queue, shared: shared.clone(), metrics: self.metrics.clone() };
+        let keeps = self.tasks.clone();
         let begin = SessionEvent::Recording {
             version: VERSION,
             room: room.to_string(),
             server: env!("CARGO_PKG_VERSION").into(),
             character: Box::new(self.character.clone()),
+            clock,
         };
         let (layout, most_bytes, metrics, room) = (self.layout.clone(), self.config.file_bytes, self.metrics.clone(), room.clone());
         let open = move |shared: &Shared| {
@@ -198,7 +206,7 @@ impl Recorder {
             *lock(&shared.file) = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             tracing::info!(file = %path.display(), "recording");
             let mut writer = RecordingWriter::new(file, layout, most_bytes)?;
-            writer.event(started.unix_nanos, &begin)?;
+            writer.event(unix_nanos, &begin)?;
             Ok::<_, RecordError>(writer)
         };
         let run = move || {
@@ -298,22 +306,13 @@ fn stamp(time: SystemTime) -> String {
     format!("{year:04}{month:02}{day:02}T{:02}{:02}{:02}Z", second / 3600, second / 60 % 60, second % 60)
 }
 
-/// The Unix clock when something began, going on by a clock that never goes back.
-#[derive(Debug, Clone, Copy)]
-struct Clock {
-    unix_nanos: u64,
-    at: Instant,
+/// Of the Unix clock.
+fn unix_nanos() -> u64 {
+    nanos(SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default())
 }
 
-impl Clock {
-    fn now() -> Self {
-        let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        Self { unix_nanos: u64::try_from(unix.as_nanos()).unwrap_or(u64::MAX / 2), at: Instant::now() }
-    }
-
-    fn nanos(&self) -> u64 {
-        self.unix_nanos.saturating_add(u64::try_from(self.at.elapsed().as_nanos()).unwrap_or(u64::MAX / 2))
-    }
+fn nanos(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX / 2)
 }
 
 /// What the room and the thread both know.
@@ -332,21 +331,23 @@ struct Shared {
 
 /// The room's end of a recording. The file is finished when the last of these is dropped.
 pub(crate) struct Sink {
-    started: Clock,
+    started: Instant,
+    /// What the Unix clock said when the room's clock was at 0, ns.
+    clock: u64,
     queue: SyncSender<(u64, Item)>,
     shared: Arc<Shared>,
     metrics: Arc<Metrics>,
 }
 
 impl Sink {
-    /// Records `item` as of now, unless the disk is too slow. Never waits.
-    pub fn put(&self, item: Item) {
+    /// Records `item` as of `at` on the room's clock, ns, unless the disk is too slow. Never waits.
+    pub fn put(&self, at: u64, item: Item) {
         let num_bytes = item.num_bytes();
         let before = self.shared.waiting_bytes.fetch_add(num_bytes, Ordering::Relaxed);
         let sent = if before + num_bytes > QUEUE_BYTES {
             false
         } else {
-            match self.queue.try_send((self.started.nanos(), item)) {
+            match self.queue.try_send((self.clock.saturating_add(at), item)) {
                 Ok(()) => return,
                 Err(TrySendError::Full(_)) => false,
                 // The recording has failed, which is counted once.
@@ -369,7 +370,7 @@ impl Sink {
     pub fn status(&self) -> RecorderStatus {
         RecorderStatus {
             file: lock(&self.shared.file).clone(),
-            seconds: self.started.at.elapsed().as_secs_f64(),
+            seconds: self.started.elapsed().as_secs_f64(),
             bytes: self.shared.bytes.load(Ordering::Relaxed),
             dropped: self.shared.dropped.load(Ordering::Relaxed),
             error: lock(&self.shared.end).clone().filter(|error| !error.is_empty()),
@@ -673,22 +674,22 @@ mod tests {
     fn what_does_not_fit_into_the_queue_is_counted_and_not_waited_for() {
         let (queue, items) = sync_channel(2);
         let metrics = Arc::new(Metrics::new());
-        let sink = Sink { started: Clock::now(), queue, shared: Arc::default(), metrics: metrics.clone() };
+        let sink = Sink { started: Instant::now(), clock: 0, queue, shared: Arc::default(), metrics: metrics.clone() };
         let slot: Arc<str> = "main".into();
         let text = |len: usize| Item::Text { slot: slot.clone(), t: None, text: "x".repeat(len).into() };
         let start = Instant::now();
         for _ in 0..5 {
-            sink.put(text(10));
+            sink.put(1, text(10));
         }
         assert_eq!((sink.status().dropped, metrics.recording_dropped.get()), (3, 3));
         assert_eq!(sink.shared.waiting_bytes.load(Ordering::Relaxed), 20);
         // One that has room by number and not by bytes.
         items.recv().unwrap();
-        sink.put(text(QUEUE_BYTES));
+        sink.put(1, text(QUEUE_BYTES));
         assert_eq!(sink.status().dropped, 4);
         // After the end nothing is counted any more: that it has failed is.
         drop(items);
-        sink.put(text(10));
+        sink.put(1, text(10));
         assert_eq!(sink.status().dropped, 4);
         assert!(start.elapsed() < Duration::from_secs(1));
     }
@@ -698,15 +699,15 @@ mod tests {
         let dir = std::env::temp_dir().join(format!("rhytid-writer-{}", std::process::id()));
         std::fs::create_dir_all(&dir).unwrap();
         let (character, _) = crate::load_character(None).unwrap();
-        let hello = rhytid_shared::view::ViewHello::new("a", &character, String::new()).character;
         let metrics = Arc::new(Metrics::new());
         let config = RecordConfig { dir: Some(dir.clone()), file_bytes: 20_000, recordings: 1, ..RecordConfig::default() };
-        let recorder = Recorder::new(config, hello, PacketLayout::from(&*character), metrics.clone());
-        let (keeps, _kept) = mpsc::channel(1);
+        let (tasks, _kept) = mpsc::channel(1);
+        let recorder = Recorder::new(config, &character, metrics.clone(), tasks);
+        let since = Instant::now();
         let room = RoomName::new("a").unwrap();
-        let (sink, made) = recorder.start(&room, keeps.clone()).unwrap();
+        let (sink, made) = recorder.start(&room, since).unwrap();
         made.recv().unwrap().unwrap();
-        let Err(RecordError::TooMany { most: 1 }) = recorder.start(&room, keeps) else { panic!("one is the limit") };
+        let Err(RecordError::TooMany { most: 1 }) = recorder.start(&room, since) else { panic!("one is the limit") };
         sink.shared.gap.store(7, Ordering::Relaxed);
         let mut seed = 1u64;
         let start = Instant::now();
@@ -718,7 +719,7 @@ mod tests {
             })
             .take(2000)
             .collect();
-            sink.put(Item::Text { slot: "main".into(), t: Some(1.0), text: noise.into() });
+            sink.put(nanos(since.elapsed()), Item::Text { slot: "main".into(), t: Some(1.0), text: noise.into() });
             std::thread::sleep(Duration::from_millis(20));
             assert!(start.elapsed() < Duration::from_secs(20), "it ends when the file is full");
         }

@@ -1,15 +1,16 @@
 //! One sender's expression weights through a session: mirroring, neutral, smoothing, bones.
 
 use super::calibration::Calibration;
-use super::config::SolveConfig;
+use super::config::{OneEuroConfig, SolveConfig};
 use super::easing::FaceState;
 use super::error::SolveError;
 use super::filter::OneEuroBank;
+use super::mix::group_of_shape;
 use super::rotation;
 use super::weights_to_bones::{WeightRig, Weights};
 use glam::{DQuat, DVec3};
 use rhytid_shared::limits::MAX_HEAD_TRAVEL;
-use rhytid_shared::{ARKIT_NAMES, ArkitShape, Character, HeadPose, NUM_ARKIT_SHAPES};
+use rhytid_shared::{ARKIT_NAMES, ArkitShape, ChannelGroup, Character, HeadPose, NUM_ARKIT_SHAPES};
 
 /// Largest weight a tracker may give: some overshoot on strong faces.
 const LARGEST_WEIGHT: f32 = 1.2;
@@ -18,8 +19,9 @@ const LARGEST_NEUTRAL: f32 = 0.5;
 
 pub(super) struct WeightSession {
     rig: WeightRig,
-    bank: OneEuroBank,
-    samples: Box<[f64; NUM_ARKIT_SHAPES]>,
+    /// Brows, eyes and the rest, each with its shapes.
+    banks: [(OneEuroBank, Vec<usize>); 3],
+    samples: Vec<f64>,
     /// The shape each shape is read from: itself, or its partner on the other side.
     source_of: Option<Box<[usize; NUM_ARKIT_SHAPES]>>,
     neutral: Box<Weights>,
@@ -32,8 +34,13 @@ impl WeightSession {
     pub(super) fn new(character: &Character, config: &SolveConfig) -> Self {
         Self {
             rig: WeightRig::new(character),
-            bank: OneEuroBank::new(config.filter.weights, NUM_ARKIT_SHAPES, 1.0),
-            samples: Box::new([0.0; NUM_ARKIT_SHAPES]),
+            banks: [&[ChannelGroup::Brows][..], &[ChannelGroup::Lids, ChannelGroup::Gaze], &[ChannelGroup::Mouth, ChannelGroup::Head]].map(
+                |groups| {
+                    let shapes: Vec<usize> = (0..NUM_ARKIT_SHAPES).filter(|&i| groups.contains(&group_of_shape(ARKIT_NAMES[i]))).collect();
+                    (OneEuroBank::new(config.filter.weights, shapes.len(), 1.0), shapes)
+                },
+            ),
+            samples: Vec::with_capacity(NUM_ARKIT_SHAPES),
             source_of: config.mirror.then(|| Box::new(std::array::from_fn(other_side))),
             neutral: Box::new([0.0; NUM_ARKIT_SHAPES]),
             last_t: None,
@@ -56,9 +63,29 @@ impl WeightSession {
         Some(&self.neutral)
     }
 
-    /// Delay that the smoothing adds at present, seconds.
-    pub(super) fn added_delay(&self) -> f64 {
-        self.bank.delay()
+    /// Delays that the smoothing adds at present, seconds: brows, eyes, the rest.
+    pub(super) fn added_delays(&self) -> [f64; 3] {
+        [0, 1, 2].map(|group| self.banks[group].0.delay())
+    }
+
+    /// Smooths brows, eyes and the rest with other parameters from the next frame on.
+    pub(super) fn set_filters(&mut self, filters: [OneEuroConfig; 3]) {
+        for ((bank, _), filter) in self.banks.iter_mut().zip(filters) {
+            bank.set_config(filter);
+        }
+    }
+
+    /// Swaps the sides of the shapes that trackers disagree about, and of all where `mirror` says so.
+    pub(super) fn set_sides(&mut self, mirror: bool, swap_jaw: bool, swap_mouth: bool) {
+        let source = |shape: usize| {
+            let is_swapped = match ARKIT_NAMES[shape] {
+                "jawLeft" | "jawRight" => mirror != swap_jaw,
+                "mouthLeft" | "mouthRight" => mirror != swap_mouth,
+                _ => mirror,
+            };
+            if is_swapped { other_side(shape) } else { shape }
+        };
+        self.source_of = (mirror || swap_jaw || swap_mouth).then(|| Box::new(std::array::from_fn(source)));
     }
 
     pub(super) fn solve(&mut self, t: f64, weights: &Weights, state: &mut FaceState) -> Result<(), SolveError> {
@@ -69,13 +96,18 @@ impl WeightSession {
             let source = self.source_of.as_ref().map_or(shape, |table| table[shape]);
             weights[source].clamp(0.0, LARGEST_WEIGHT)
         });
-        for shape in 0..NUM_ARKIT_SHAPES {
-            let neutral = self.neutral[shape];
-            self.samples[shape] = f64::from(((seen[shape] - neutral) / (1.0 - neutral)).max(0.0));
-        }
         let dt = self.last_t.map_or(f64::INFINITY, |last| t - last);
-        let smoothed = self.bank.update(&self.samples[..], dt);
-        let smoothed: Weights = std::array::from_fn(|shape| smoothed[shape] as f32);
+        let mut smoothed: Weights = [0.0; NUM_ARKIT_SHAPES];
+        for (bank, shapes) in &mut self.banks {
+            self.samples.clear();
+            self.samples.extend(shapes.iter().map(|&shape| {
+                let neutral = self.neutral[shape];
+                f64::from(((seen[shape] - neutral) / (1.0 - neutral)).max(0.0))
+            }));
+            for (&shape, value) in shapes.iter().zip(bank.update(&self.samples, dt)) {
+                smoothed[shape] = *value as f32;
+            }
+        }
         match &mut self.last {
             Some(last) => **last = seen,
             None => self.last = Some(Box::new(seen)),

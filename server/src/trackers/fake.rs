@@ -96,10 +96,14 @@ pub struct FakeOptions {
 
 /// Plays a feed until its end or until `stop` is done. Gives the frames sent; `bound` learns where it sends from.
 pub async fn fake(options: &FakeOptions, bound: impl FnOnce(SocketAddr), stop: impl Future<Output = ()>) -> Result<u64, FakeError> {
+    let asks_nobody = matches!(options.kind, FakeKind::OpenSeeFace | FakeKind::LiveLink | FakeKind::Vmc);
+    if asks_nobody && options.to.is_none() {
+        return Err(FakeError::Content("nobody asks this sender to start, expected --to IP:PORT".into()));
+    }
     let problem = |source| FakeError::Socket { address: options.bind, source };
     let socket = UdpSocket::bind(options.bind).await.map_err(problem)?;
     bound(socket.local_addr().map_err(problem)?);
-    let mut actor = Actor::new(options, socket)?;
+    let mut actor = Actor::new(options, socket);
     tokio::pin!(stop);
     let mut offset = 0.0;
     loop {
@@ -152,6 +156,10 @@ impl Scenes {
             match self.feed.next_frame(&mut self.frame)? {
                 None => return Ok(None),
                 Some(FeedItem::Calibrate) => self.pipeline.calibrate(),
+                Some(FeedItem::Settings(change)) => self.pipeline.set(&change)?,
+                Some(FeedItem::Recentre) => {
+                    self.pipeline.recentre();
+                }
                 Some(FeedItem::Frame) => return Ok(Some((self.frame.t, self.scene()?))),
             }
         }
@@ -221,13 +229,9 @@ struct Actor<'a> {
 }
 
 impl<'a> Actor<'a> {
-    fn new(options: &'a FakeOptions, socket: UdpSocket) -> Result<Self, FakeError> {
-        let asks = matches!(options.kind, FakeKind::OpenSeeFace | FakeKind::LiveLink | FakeKind::Vmc);
-        if asks && options.to.is_none() {
-            return Err(FakeError::Content("this sender waits for nobody to ask, expected --to ADDRESS".into()));
-        }
+    fn new(options: &'a FakeOptions, socket: UdpSocket) -> Self {
         let unix = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
-        Ok(Self {
+        Self {
             options,
             socket,
             to: options.to,
@@ -242,7 +246,7 @@ impl<'a> Actor<'a> {
             start: None,
             unix,
             num_frames: 0,
-        })
+        }
     }
 
     /// Sends a scene in its time, and answers meanwhile. May be dropped at any await.

@@ -235,7 +235,10 @@ impl Receiver {
             kind::SCHEMA | kind::FRAME => {}
             // They say that somebody is there, which the socket has noticed.
             kind::PONG => return Ok(Output::default()),
-            kind::ERROR => return Err(Refusal::NoSession),
+            kind::ERROR => {
+                tracing::debug!(reason = ?String::from_utf8_lossy(chunk), "the phone refuses");
+                return Err(Refusal::NoSession);
+            }
             _ => return Err(Refusal::NoContent),
         }
         if header.kind == kind::FRAME {
@@ -245,7 +248,7 @@ impl Receiver {
                 return Err(Refusal::WrongCount);
             }
             if self.last_sequence.is_some_and(|last| !is_newer(header.sequence, last)) {
-                return Err(Refusal::NoSession);
+                return Err(Refusal::Late);
             }
         }
         let Some(payload) = self.assemble(header, chunk, now)? else { return Ok(Output::default()) };
@@ -569,7 +572,7 @@ mod tests {
         let Sight::Weights(seen) = seen.sight else { panic!("weights") };
         assert!(seen.weights.iter().zip(&weights).all(|(a, b): (&f32, &f32)| (a - b).abs() < 1e-6));
         assert!(seen.head_rotation.unwrap().abs_diff_eq(head, 1e-5));
-        assert_eq!(receiver.take(&frame[0], 0.1), Err(Refusal::NoSession), "the same again");
+        assert_eq!(receiver.take(&frame[0], 0.1), Err(Refusal::Late), "the same again");
         let nobody = sender.frame(None);
         assert_eq!(receiver.take(&nobody[0], 0.2).unwrap().seen.unwrap().sight, Sight::NoFace);
     }

@@ -8,11 +8,11 @@ use super::session::{Clock, Framer, Swaps, Tick, hello, room_of};
 use super::spec::{ListenSpec, RoomRule};
 use super::{Protocol, Refusal, Seen, Sight, fmv3, ifacialmocap, livelink, openseeface, sniff, vmc, vts};
 use crate::config::seconds;
-use crate::intake::{Begun, Intake, IntakeError};
 use crate::publish::Rate;
 use crate::room::Evicted;
 use crate::service::{Hub, ServerError, stopped};
-use rhytid_shared::RoomName;
+use crate::source::{FrameError, OpenError, Source};
+use rhytid_shared::{RoomName, Slot};
 use serde::Serialize;
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
@@ -27,6 +27,8 @@ pub(crate) const MOST_PERFORMERS: usize = 16;
 const ROUND: Duration = Duration::from_millis(200);
 /// A room that could not be had is asked for again this often.
 const RETRY: Duration = Duration::from_secs(1);
+/// Sessions a second that begin on one port: each sets up a solve, which costs more than thousands of frames.
+const SESSIONS_PER_SECOND: u32 = 10;
 /// Whoever has been silent for this long gives way to a newcomer on the same port, as an app does that was started again.
 const GIVES_WAY: Duration = Duration::from_millis(750);
 /// A phone that has been silent for this long is asked again.
@@ -66,7 +68,8 @@ pub(crate) struct PortListing {
 struct PerformerListing {
     source: String,
     room: String,
-    /// Its session in the room; nothing while another publisher has it.
+    slot: String,
+    /// Its session in the room; nothing while another publisher has its slot.
     session: Option<u32>,
     /// Seconds since its last datagram.
     silent: f64,
@@ -121,16 +124,21 @@ async fn run(hub: Arc<Hub>, index: usize, port: Port) {
                 }
             },
         }
-        send_all(&port.socket, &mut out);
+        send_all(&port, &mut out);
     }
     listener.say_goodbye(&mut out);
-    send_all(&port.socket, &mut out);
+    send_all(&port, &mut out);
 }
 
 /// Sends without waiting: what the kernel has no room for is asked for again anyway.
-fn send_all(socket: &UdpSocket, out: &mut Vec<(SocketAddr, Vec<u8>)>) {
+fn send_all(port: &Port, out: &mut Vec<(SocketAddr, Vec<u8>)>) {
     for (to, bytes) in out.drain(..) {
-        if let Err(error) = socket.try_send_to(&bytes, to) {
+        // A socket of IPv6 reaches IPv4 by its mapped addresses.
+        let to = match to.ip() {
+            IpAddr::V4(ip) if port.address.is_ipv6() => SocketAddr::new(ip.to_ipv6_mapped().into(), to.port()),
+            _ => to,
+        };
+        if let Err(error) = port.socket.try_send_to(&bytes, to) {
             tracing::debug!(%to, %error, "cannot send");
         }
     }
@@ -146,6 +154,7 @@ struct Listener<'a> {
     nonce: u64,
     senders: HashMap<SocketAddr, Sender>,
     performers: HashMap<Key, Performer>,
+    begins: Rate,
     hellos: fmv3::Hellos,
     last_heard: Option<Instant>,
     last_request: Option<Instant>,
@@ -169,27 +178,32 @@ struct Key {
 struct Performer {
     source: String,
     room: RoomName,
+    slot: Slot,
     clock: Clock,
     rate: Rate,
     last_heard: Instant,
-    /// When the room may be asked for again.
+    /// When the slot may be asked for again, and why it was not to be had.
     retry_at: Instant,
+    refusal: &'static str,
+    begun_at: Option<Instant>,
     num_sessions: u32,
     live: Option<Live>,
 }
 
 /// A performer's session in a room.
 struct Live {
-    intake: Intake,
+    source: Source,
     evicted: Evicted,
     framer: Framer,
     /// The picture that the session's landmarks are of.
     image: Option<[f32; 2]>,
 }
 
-impl Drop for Live {
-    fn drop(&mut self) {
-        self.intake.end();
+impl Performer {
+    /// Without a place in its room, which it asks for again later.
+    fn lose_slot(&mut self, now: Instant, why: &'static str) {
+        self.live = None;
+        (self.retry_at, self.refusal) = (now + RETRY, why);
     }
 }
 
@@ -205,6 +219,7 @@ impl<'a> Listener<'a> {
             nonce: std::collections::hash_map::RandomState::new().build_hasher().finish() | 1,
             senders: HashMap::new(),
             performers: HashMap::new(),
+            begins: Rate::new(SESSIONS_PER_SECOND, Instant::now()),
             hellos: fmv3::Hellos::default(),
             last_heard: None,
             last_request: None,
@@ -308,7 +323,7 @@ impl<'a> Listener<'a> {
             let oldest = self.senders.iter().min_by_key(|(_, sender)| sender.last_heard).map(|(key, sender)| (*key, sender.last_heard));
             match oldest {
                 Some((key, heard)) if now - heard >= GIVES_WAY => self.senders.remove(&key),
-                _ => return Err(Refusal::WrongCount),
+                _ => return Err(Refusal::TooManySenders),
             };
         }
         let sender = self.senders.entry(from).or_insert_with(|| Sender { vmc: None, fmv3: None, last_heard: now });
@@ -325,15 +340,18 @@ impl<'a> Listener<'a> {
             self.make_room(now)?;
             let room = match &self.spec.room {
                 RoomRule::Named(room) => room.clone(),
-                RoomRule::Subject => room_of(&seen.subject),
+                RoomRule::Subject => room_of(protocol, &seen.subject),
             };
             let performer = Performer {
                 source: hello(protocol, &seen, from.ip()).source,
                 room,
+                slot: self.spec.slot_of(protocol),
                 clock: Clock::default(),
                 rate: Rate::new(self.hub.config.limits.frames_per_second, now),
                 last_heard: now,
                 retry_at: now,
+                refusal: "",
+                begun_at: None,
                 num_sessions: 0,
                 live: None,
             };
@@ -362,8 +380,7 @@ impl<'a> Listener<'a> {
             performer.live = None;
         }
         if performer.live.as_mut().is_some_and(|live| live.evicted.try_recv().is_ok()) {
-            performer.live = None;
-            performer.retry_at = now + RETRY;
+            performer.lose_slot(now, "taken_over");
         }
         if performer.live.is_none() {
             if seen.sight == Sight::NoFace {
@@ -374,20 +391,18 @@ impl<'a> Listener<'a> {
         }
         let performer = self.performers.get_mut(&key).expect("nobody has removed it");
         let live = performer.live.as_mut().expect("the session has begun");
-        match live.intake.frame(self.hub, live.framer.frame(t, &seen.sight), None) {
-            Ok(true) => {
+        match live.source.frame(self.hub, live.framer.frame(t, &seen.sight), None) {
+            Ok(()) => {
                 self.hub.metrics.tracker_frame(protocol.name());
-                if live.intake.pipeline.take_calibrated().is_some() {
-                    live.intake.keep_neutral();
-                }
+                // Nobody is to be told; the room keeps it.
+                live.source.take_calibrated();
                 Ok(())
             }
-            Ok(false) => {
-                performer.live = None;
-                performer.retry_at = now + RETRY;
+            Err(FrameError::Evicted) => {
+                performer.lose_slot(now, "taken_over");
                 Err("taken_over")
             }
-            Err(error) => {
+            Err(FrameError::Bad(error)) => {
                 tracing::debug!(%from, %error, "frame refused");
                 Err("bad_frame")
             }
@@ -405,46 +420,52 @@ impl<'a> Listener<'a> {
                 self.performers.remove(&key);
                 Ok(())
             }
-            _ => Err("too_many_performers"),
+            _ => Err(Refusal::TooManySenders.label()),
         }
     }
 
-    /// Begins a session of the performer `key` in its room.
+    /// Begins a session of the performer `key` in its slot.
     fn begin(&mut self, key: &Key, protocol: Protocol, seen: &Seen, ip: IpAddr, now: Instant) -> Result<(), &'static str> {
         let performer = self.performers.get_mut(key).expect("sessions are of performers");
         if now < performer.retry_at {
-            return Err("room_taken");
+            return Err(performer.refusal);
         }
-        let (room, num_sessions) = (performer.room.clone(), performer.num_sessions);
+        if performer.begun_at.is_some_and(|begun| now - begun < RETRY) || !self.begins.take_if_free(now) {
+            return Err("too_many_sessions");
+        }
+        let (room, slot, num_sessions) = (performer.room.clone(), performer.slot.clone(), performer.num_sessions);
         for (other, silent) in &mut self.performers {
-            if other != key && silent.room == room && now - silent.last_heard >= GIVES_WAY {
+            if other != key && silent.room == room && silent.slot == slot && now - silent.last_heard >= GIVES_WAY {
                 silent.live = None;
             }
         }
         let mut hello = hello(protocol, seen, ip);
         // The same tracker that begins anew sees the same face.
         hello.keep_neutral = num_sessions > 0;
-        let begun = Intake::begin(self.hub, &room, hello, None);
+        hello.slot = slot;
+        let begun = Source::open(self.hub, &room, hello, None);
         let performer = self.performers.get_mut(key).expect("sessions are of performers");
         match begun {
-            Ok(Begun { intake, evicted, .. }) => {
+            Ok((source, evicted)) => {
                 let usual = Swaps::usual(protocol);
                 let swaps = Swaps { jaw: self.spec.swap_jaw.unwrap_or(usual.jaw), mouth: self.spec.swap_mouth.unwrap_or(usual.mouth) };
                 let image = match seen.sight {
                     Sight::Landmarks { image, .. } => Some(image),
                     _ => None,
                 };
+                performer.begun_at = Some(now);
                 performer.num_sessions = num_sessions.saturating_add(1);
-                performer.live = Some(Live { intake, evicted, framer: Framer::new(swaps), image });
+                performer.live = Some(Live { source, evicted, framer: Framer::new(swaps), image });
                 Ok(())
             }
             Err(error) => {
-                performer.retry_at = now + RETRY;
                 tracing::debug!(%room, source = performer.source, %error, "tracker has no room");
-                Err(match error {
-                    IntakeError::Hello(_) => "bad_frame",
-                    IntakeError::Room(error) => error.code(),
-                })
+                let refusal = match error {
+                    OpenError::Hello(_) => "bad_frame",
+                    OpenError::Room(error) => error.code(),
+                };
+                performer.lose_slot(now, refusal);
+                Err(refusal)
             }
         }
     }
@@ -499,7 +520,8 @@ impl<'a> Listener<'a> {
             .map(|performer| PerformerListing {
                 source: performer.source.clone(),
                 room: performer.room.to_string(),
-                session: performer.live.as_ref().map(|live| live.intake.place.session),
+                slot: performer.slot.name.clone(),
+                session: performer.live.as_ref().map(|live| live.source.session()),
                 silent: (now - performer.last_heard).as_secs_f64(),
             })
             .collect();

@@ -175,7 +175,7 @@ mod tests {
     #[test]
     fn rows_become_frames_and_gaps_faces_that_are_lost() {
         let text = header() + &row(10.0, 0, 0.0) + &row(10.0, 1, 9.0) + &row(10.04, 0, 1.0) + "\r\n" + &row(12.0, 0, 2.0);
-        let lines = std::io::BufReader::new(OpenSeeFaceCsv::new(text.as_bytes()));
+        let lines = io::BufReader::new(OpenSeeFaceCsv::new(text.as_bytes()));
         let mut feed = Feed::new_for_any_character(lines, "log".into()).unwrap();
         assert_eq!((feed.hello.image, feed.hello.focal), (Some([640.0, 480.0]), Some(640.0)));
         let (mut frame, mut seen) = (TrackingFrame::default(), Vec::new());

@@ -141,12 +141,13 @@ pub(crate) fn hello(protocol: Protocol, seen: &Seen, ip: std::net::IpAddr) -> Pu
     }
 }
 
-/// A room's name from what a sender calls the performer.
-pub(crate) fn room_of(subject: &str) -> rhytid_shared::RoomName {
+/// A room's name from what a sender calls the performer, or from the protocol where it calls them nothing.
+pub(crate) fn room_of(protocol: Protocol, subject: &str) -> rhytid_shared::RoomName {
     let name: String =
         subject.chars().take(64).map(|letter| if letter.is_ascii_alphanumeric() || letter == '_' { letter } else { '-' }).collect();
     let name = name.trim_matches('-');
-    rhytid_shared::RoomName::new(if name.is_empty() { "subject" } else { name }).expect("only letters that a room's name has are left")
+    rhytid_shared::RoomName::new(if name.is_empty() { protocol.name() } else { name })
+        .expect("only letters that a room's name has are left")
 }
 
 #[cfg(test)]
@@ -186,9 +187,10 @@ mod tests {
 
     #[test]
     fn names_are_made_of_subjects() {
-        assert_eq!(room_of("Anna's iPhone").as_str(), "Anna-s-iPhone");
-        assert_eq!(room_of("日本").as_str(), "subject");
-        assert_eq!(room_of(&"x".repeat(500)).as_str().len(), 64);
+        let room_of = |subject: &str| room_of(Protocol::LiveLink, subject).to_string();
+        assert_eq!(room_of("Anna's iPhone"), "Anna-s-iPhone");
+        assert_eq!((room_of("日本"), room_of("")), ("livelink".to_owned(), "livelink".to_owned()));
+        assert_eq!(room_of(&"x".repeat(500)).len(), 64);
         let seen = Seen { performer: String::new(), subject: "iPhone\n".into(), time: None, sight: Sight::NoFace };
         assert_eq!(hello(Protocol::LiveLink, &seen, [127, 0, 0, 1].into()).source, "livelink: iPhone (127.0.0.1)");
     }

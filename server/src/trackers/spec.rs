@@ -3,15 +3,13 @@
 use super::Protocol;
 use super::fmv3;
 use super::ifacialmocap::Dialect;
-use rhytid_shared::RoomName;
+use rhytid_shared::{ChannelGroup, ChannelGroups, RoomName, Slot};
 use serde::Deserialize;
 use std::net::{IpAddr, SocketAddr};
 use std::str::FromStr;
 
 /// Most phones' addresses that a port takes datagrams from.
 const MOST_ALLOWED: usize = 64;
-/// The groups of a face that a source may drive.
-const GROUPS: [&str; 5] = ["brows", "lids", "gaze", "mouth", "head"];
 
 /// Why an option was refused: one sentence.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -40,9 +38,9 @@ pub struct ListenSpec {
     /// The source slot, by default called as the protocol.
     pub slot: Option<RoomName>,
     /// Higher wins, 0 to 100.
-    pub priority: Option<u8>,
-    /// The groups of the face that it may drive; empty: all.
-    pub groups: Vec<&'static str>,
+    pub priority: u8,
+    /// The groups of the face that it may drive.
+    pub groups: ChannelGroups,
     /// Where datagrams may come from; empty: anywhere.
     pub allow: Vec<IpAddr>,
     /// The phone that is asked to send.
@@ -81,8 +79,8 @@ impl FromStr for ListenSpec {
             address: parse("address", address, "an IP address and a port")?,
             room: RoomRule::Named(room_name("demo")?),
             slot: None,
-            priority: None,
-            groups: Vec::new(),
+            priority: Slot::PRIORITY,
+            groups: ChannelGroups::ALL,
             allow: Vec::new(),
             phone: None,
             dialect: (protocol == Some(Protocol::IFacialMocap)).then_some(Dialect::V2),
@@ -117,14 +115,16 @@ impl ListenSpec {
                 if priority > 100 {
                     return Err(SpecError(format!("option priority is {priority}, expected 0 to 100")));
                 }
-                self.priority = Some(priority);
+                self.priority = priority;
             }
             "groups" => {
+                self.groups = ChannelGroups::NONE;
                 for group in value.split('+') {
-                    let known = GROUPS.into_iter().find(|known| *known == group);
-                    self.groups.push(known.ok_or_else(|| {
-                        SpecError(format!("option groups has {:?}, expected some of {} with + between them", cut(group), GROUPS.join(", ")))
-                    })?);
+                    let known = ChannelGroup::from_name(group).ok_or_else(|| {
+                        let all = ChannelGroup::ALL.map(ChannelGroup::name).join(", ");
+                        SpecError(format!("option groups has {:?}, expected some of {all} with + between them", cut(group)))
+                    })?;
+                    self.groups = self.groups.with(known);
                 }
             }
             "allow" => {
@@ -147,13 +147,19 @@ impl ListenSpec {
             "swap_mouth" => self.swap_mouth = Some(parse("option swap_mouth", value, "true or false")?),
             _ => {
                 return Err(SpecError(format!(
-                    "option {:?} is not known to {}, expected room, slot, priority, groups, allow, phone, version, swap_jaw or swap_mouth",
+                    "option {:?} is not known to {}, expected room, allow, phone, version, swap_jaw or swap_mouth",
                     cut(key),
                     self.protocol_name()
                 )));
             }
         }
         Ok(())
+    }
+
+    /// The slot of a performer whose datagrams are of this protocol.
+    pub(super) fn slot_of(&self, protocol: Protocol) -> Slot {
+        let name = self.slot.as_ref().map_or_else(|| protocol.name().to_owned(), ToString::to_string);
+        Slot { name, priority: self.priority, groups: self.groups }
     }
 
     /// True where [`fmv3::hello`] is what the phone is asked with.
@@ -239,10 +245,15 @@ mod tests {
             "ifacialmocap=0.0.0.0:49983,phone=192.0.2.7:49983,room=subject,slot=phone,priority=70,groups=mouth+head,version=3,swap_jaw=true"
                 .parse()
                 .unwrap();
-        assert_eq!((spec.room.clone(), spec.priority, spec.groups.clone()), (RoomRule::Subject, Some(70), vec!["mouth", "head"]));
+        assert_eq!((spec.room.clone(), spec.slot_of(Protocol::Fmv3)), {
+            let groups = ChannelGroups::NONE.with(ChannelGroup::Mouth).with(ChannelGroup::Head);
+            (RoomRule::Subject, Slot { name: "phone".into(), priority: 70, groups })
+        });
         assert_eq!(spec.allow, ["192.0.2.7".parse::<IpAddr>().unwrap()], "only the phone that is asked may answer");
         assert!(spec.asks_fmv3() && spec.swap_jaw == Some(true) && spec.swap_mouth.is_none());
         assert_eq!("any=[::1]:9".parse::<ListenSpec>().unwrap().protocol, None);
+        let plain = Slot { name: "vts".into(), ..Slot::default() };
+        assert_eq!("any=[::1]:9".parse::<ListenSpec>().unwrap().slot_of(Protocol::Vts), plain);
         let out: VmcOutSpec = "127.0.0.1:39539,room=stage".parse().unwrap();
         assert_eq!((out.address.port(), out.room.as_str()), (39539, "stage"));
     }
@@ -254,8 +265,6 @@ mod tests {
             ("kinect=127.0.0.1:1", "protocol is \"kinect\", expected any, openseeface, livelink"),
             ("livelink=localhost", "address is \"localhost\", expected an IP address and a port"),
             ("livelink=127.0.0.1:1,room=a b", "room name \"a b\" is not"),
-            ("livelink=127.0.0.1:1,priority=101", "option priority is 101"),
-            ("livelink=127.0.0.1:1,groups=ears", "option groups has \"ears\""),
             ("livelink=127.0.0.1:1,phone=127.0.0.1:1", "option phone is for"),
             ("livelink=127.0.0.1:1,version=3", "option \"version\" is not known to livelink"),
             ("livelink=127.0.0.1:1,x", "\"x\" is no option=value"),

@@ -2,7 +2,7 @@
 
 use super::spec::VmcOutSpec;
 use super::vmc;
-use crate::room::{RoomError, Viewing};
+use crate::room::Viewing;
 use crate::service::{Hub, ServerError, stopped};
 use rhytid_shared::FaceFrame;
 use rhytid_shared::packet::Decoder;
@@ -50,7 +50,7 @@ async fn run(hub: &Hub, out: &VmcOut) {
     let mut viewing: Viewing = loop {
         match hub.rooms.join(&out.spec.room) {
             Ok(viewing) => break viewing,
-            Err(error @ (RoomError::TooManyRooms { .. } | RoomError::TooManyViewers { .. } | RoomError::Taken)) => {
+            Err(error) => {
                 tracing::debug!(%error, room = %out.spec.room, "no place for VMC out");
                 tokio::time::sleep(RETRY).await;
             }

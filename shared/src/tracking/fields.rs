@@ -3,6 +3,8 @@
 
 use super::MessageError;
 use super::reader::Names;
+use super::settings::Settings;
+use super::slot::{ChannelGroup, ChannelGroups};
 use crate::limits::{MAX_EXPRESSIONS, MAX_FEATURE_POINTS, MAX_HEAD_TRAVEL};
 use crate::names::{ArkitShape, NUM_ARKIT_SHAPES};
 use glam::{Quat, Vec3};
@@ -11,7 +13,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 /// Farthest a landmark may lie from the picture's origin, pixels: more than any camera has, less than what overflows.
-const MAX_PIXELS: f64 = 1e5;
+pub(super) const MAX_PIXELS: f64 = 1e5;
 /// Largest weight that still reads as a slip of a tracker and not as another unit (percent, degrees).
 const MAX_WEIGHT: f64 = 10.0;
 /// Largest weight passed on; trackers overshoot 1 a little.
@@ -31,6 +33,8 @@ pub(super) enum Kind {
     Hello,
     Frame,
     Calibrate,
+    Settings,
+    Recentre,
 }
 
 /// The layout of a hello as it was written.
@@ -51,6 +55,12 @@ pub(super) struct Fields {
     pub image: Option<[f64; 2]>,
     pub focal: Option<f64>,
     pub takeover: bool,
+    pub slot: Option<String>,
+    pub priority: Option<f64>,
+    pub groups: Option<ChannelGroups>,
+    /// Of a hello, and those of a message of their own.
+    pub settings: Option<Settings>,
+    pub change: Settings,
     pub keep_neutral: bool,
     pub t: Option<f64>,
     pub face: Option<bool>,
@@ -86,6 +96,11 @@ impl Fields {
             image: None,
             focal: None,
             takeover: false,
+            slot: None,
+            priority: None,
+            groups: None,
+            settings: None,
+            change: Settings::default(),
             keep_neutral: false,
             t: None,
             face: None,
@@ -113,6 +128,8 @@ impl Fields {
         (self.version, self.fps, self.focal, self.t) = (None, None, None, None);
         (self.source, self.layout, self.image) = (None, None, None);
         (self.takeover, self.keep_neutral) = (false, false);
+        (self.slot, self.priority, self.groups) = (None, None, None);
+        (self.settings, self.change) = (None, Settings::default());
         self.face = None;
         (self.has_landmarks, self.has_confidence, self.has_weights) = (false, false, false);
         (self.has_bones, self.has_expressions) = (false, false);
@@ -160,7 +177,7 @@ enum Key {
 }
 
 /// Every field of every message.
-const KEYS: [&str; 17] = [
+const KEYS: [&str; 26] = [
     "type",
     "t",
     "landmarks",
@@ -178,6 +195,15 @@ const KEYS: [&str; 17] = [
     "focal",
     "takeover",
     "keep_neutral",
+    "slot",
+    "priority",
+    "groups",
+    "settings",
+    "mirror",
+    "gains",
+    "smoothing",
+    "swap_jaw",
+    "swap_mouth",
 ];
 
 impl<'de> serde::Deserialize<'de> for Key {
@@ -218,6 +244,8 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
                         "hello" => fields.kind = Some(Kind::Hello),
                         "frame" => fields.kind = Some(Kind::Frame),
                         "calibrate" => fields.kind = Some(Kind::Calibrate),
+                        "settings" => fields.kind = Some(Kind::Settings),
+                        "recentre" => fields.kind = Some(Kind::Recentre),
                         _ => fields.refuse("unknown_type", || {
                             format!("field type is {:?}, expected \"hello\", \"frame\" or \"calibrate\"", cut(&name))
                         }),
@@ -244,6 +272,15 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
                 }
                 "focal" => fields.focal = Some(map.next_value_seed(Number("pixels"))?),
                 "takeover" => fields.takeover = map.next_value_seed(Flag)?,
+                "slot" => fields.slot = Some(map.next_value_seed(Text("the name of a source slot"))?),
+                "priority" => fields.priority = Some(map.next_value_seed(Number("a priority, 0 to 100"))?),
+                "groups" => map.next_value_seed(Groups(fields))?,
+                "settings" => fields.settings = Some(map.next_value()?),
+                "mirror" => fields.change.mirror = Some(map.next_value_seed(Flag)?),
+                "gains" => fields.change.gains = map.next_value()?,
+                "smoothing" => fields.change.smoothing = map.next_value()?,
+                "swap_jaw" => fields.change.swap_jaw = Some(map.next_value_seed(Flag)?),
+                "swap_mouth" => fields.change.swap_mouth = Some(map.next_value_seed(Flag)?),
                 _ => fields.keep_neutral = map.next_value_seed(Flag)?,
             }
             fields.reading = "";
@@ -375,6 +412,39 @@ impl<'de> Visitor<'de> for LayoutSeed {
             }
         }
         Ok(LayoutField::List(names))
+    }
+}
+
+struct Groups<'a>(&'a mut Fields);
+
+impl<'de> DeserializeSeed<'de> for Groups<'_> {
+    type Value = ();
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_seq(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Groups<'_> {
+    type Value = ();
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("an array of channel groups")
+    }
+    fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<(), A::Error> {
+        let fields = self.0;
+        let mut groups = ChannelGroups::NONE;
+        while let Some(name) = seq.next_element_seed(Text("a channel group"))? {
+            match ChannelGroup::from_name(&name) {
+                Some(group) => groups = groups.with(group),
+                None => fields.refuse("out_of_range", || {
+                    format!("field groups has {:?}, expected brows, lids, gaze, mouth and head only", cut(&name))
+                }),
+            }
+        }
+        if groups == ChannelGroups::NONE {
+            fields.refuse("out_of_range", || "field groups is empty, expected at least one of brows, lids, gaze, mouth, head".to_owned());
+        }
+        fields.groups = Some(groups);
+        Ok(())
     }
 }
 

@@ -1,7 +1,8 @@
 //! One publish session's messages, checked in their order.
 
+use super::binary;
 use super::fields::{Fields, Kind, LayoutField};
-use super::{MessageError, PublishHello, PublishMessage, TrackingData, TrackingFrame};
+use super::{MessageError, PublishHello, PublishMessage, Settings, Slot, TrackingData, TrackingFrame};
 use crate::character::Character;
 use crate::face::HeadPose;
 use crate::layout::Layout;
@@ -69,12 +70,33 @@ impl PublishReader {
                 self.hello = Some(hello.clone());
                 Ok(PublishMessage::Hello(hello))
             }
-            (Kind::Frame | Kind::Calibrate, None) => {
-                Err(MessageError::new("no_hello", "the first message must be {\"type\":\"hello\",\"version\":1,…}"))
-            }
+            (_, None) => Err(MessageError::new("no_hello", "the first message must be {\"type\":\"hello\",\"version\":1,…}")),
             (Kind::Calibrate, Some(_)) => Ok(PublishMessage::Calibrate),
+            (Kind::Recentre, Some(_)) => Ok(PublishMessage::Recentre),
+            (Kind::Settings, Some(_)) => {
+                self.fields.change.check()?;
+                Ok(PublishMessage::Settings(self.fields.change))
+            }
             (Kind::Frame, Some(_)) => self.check_frame(frame).map(|()| PublishMessage::Frame),
         }
+    }
+
+    /// Reads one binary message, which is a landmark frame (see `encode_landmarks`). After an error `frame` is as it was.
+    pub fn read_binary(&mut self, bytes: &[u8], frame: &mut TrackingFrame) -> Result<PublishMessage, MessageError> {
+        let Some(hello) = &self.hello else {
+            return Err(MessageError::new("no_hello", "the first message must be the text {\"type\":\"hello\",\"version\":1,…}"));
+        };
+        let layout = hello
+            .layout
+            .as_ref()
+            .ok_or_else(|| MessageError::new("no_layout", "frame has landmarks, expected field layout in the hello to say which"))?;
+        let t = binary::decode(bytes, layout.num_points(), &mut self.fields.landmarks, &mut self.fields.confidence)?;
+        self.check_time(t)?;
+        take_landmarks(&mut self.fields, &mut frame.data);
+        frame.expressions = None;
+        frame.t = t;
+        self.t_before = self.last_t.replace(t);
+        Ok(PublishMessage::Frame)
     }
 
     /// The frame last read was refused by what comes after the reader: the session's clock stands as it did before that frame,
@@ -114,21 +136,29 @@ impl PublishReader {
             image,
             focal: fields.focal.map(|focal| check_focal(focal, image)).transpose()?,
             takeover: fields.takeover,
+            settings: check_settings(fields.settings)?,
+            slot: Slot::check(fields.slot.take(), fields.priority, fields.groups)?,
             keep_neutral: fields.keep_neutral,
         })
     }
 
-    fn check_frame(&mut self, frame: &mut TrackingFrame) -> Result<(), MessageError> {
-        let fields = &mut self.fields;
-        let t = fields.t.ok_or_else(|| missing("t", "seconds on the sender's clock"))?;
+    fn check_time(&self, t: f64) -> Result<(), MessageError> {
+        // A NaN is in no range.
         if !(0.0..=MAX_SECONDS).contains(&t) {
             return Err(MessageError::new("out_of_range", format!("field t is {t}, expected seconds from 0 to {MAX_SECONDS}")));
         }
-        if let Some(last) = self.last_t
-            && t <= last
-        {
-            return Err(MessageError::new("time_order", format!("field t is {t}, expected more than the {last} of the frame before")));
+        match self.last_t {
+            Some(last) if t <= last => {
+                Err(MessageError::new("time_order", format!("field t is {t}, expected more than the {last} of the frame before")))
+            }
+            _ => Ok(()),
         }
+    }
+
+    fn check_frame(&mut self, frame: &mut TrackingFrame) -> Result<(), MessageError> {
+        let t = self.fields.t.ok_or_else(|| missing("t", "seconds on the sender's clock"))?;
+        self.check_time(t)?;
+        let fields = &mut self.fields;
         let head = (fields.head_rotation.is_some() || fields.head_position.is_some())
             .then(|| HeadPose { rotation: fields.head_rotation.unwrap_or_default(), position: fields.head_position.unwrap_or_default() });
         match (fields.has_landmarks, fields.has_weights, fields.has_bones) {
@@ -179,6 +209,12 @@ impl PublishReader {
         self.t_before = self.last_t.replace(t);
         Ok(())
     }
+}
+
+fn check_settings(settings: Option<Settings>) -> Result<Settings, MessageError> {
+    let settings = settings.unwrap_or_default();
+    settings.check().map_err(|error| MessageError::new(error.code, error.message.replacen("field ", "field settings.", 1)))?;
+    Ok(settings)
 }
 
 fn missing(field: &str, expected: &str) -> MessageError {
@@ -260,6 +296,12 @@ fn check_landmarks(fields: &mut Fields, layout: Option<&Layout>, data: &mut Trac
     if !fields.has_confidence {
         fields.confidence.clear();
     }
+    take_landmarks(fields, data);
+    Ok(())
+}
+
+/// Hands the points read to a frame, in exchange for its old buffers.
+fn take_landmarks(fields: &mut Fields, data: &mut TrackingData) {
     if !matches!(data, TrackingData::Landmarks { .. }) {
         *data = TrackingData::Landmarks { points: Vec::new(), confidence: Vec::new() };
     }
@@ -267,7 +309,6 @@ fn check_landmarks(fields: &mut Fields, layout: Option<&Layout>, data: &mut Trac
         std::mem::swap(points, &mut fields.landmarks);
         std::mem::swap(confidence, &mut fields.confidence);
     }
-    Ok(())
 }
 
 fn name_of(layout: &Layout) -> &'static str {
@@ -358,7 +399,7 @@ mod tests {
             (r#"{"type":"frame","landmarks":[[1,2],[3,4]]}"#, "missing_field", "field t is missing"),
             (r#"{"type":"frame","t":2}"#, "missing_field", "landmarks, weights, bones, expressions or \"face\":false"),
             (r#"{"t":2,"face":false}"#, "missing_field", "field type"),
-            (r#"{"type":"settings","t":2}"#, "unknown_type", "\"settings\""),
+            (r#"{"type":"setting","t":2}"#, "unknown_type", "\"setting\""),
             (r#"{"type":"frame","t":1,"face":false}"#, "time_order", "field t is 1, expected more than the 1"),
             (r#"{"type":"frame","t":0.5,"face":false}"#, "time_order", "expected more than the 1"),
             (r#"{"type":"frame","t":-1,"face":false}"#, "out_of_range", "field t is -1"),
@@ -392,6 +433,26 @@ mod tests {
             assert_eq!(frame, before, "{text}");
         }
         reader.read(r#"{"type":"frame","t":1.01,"face":false}"#, &mut frame).unwrap();
+    }
+
+    #[test]
+    fn a_binary_frame_is_one_like_any_other() {
+        let (mut reader, mut frame) = reader();
+        let mut bytes = Vec::new();
+        crate::tracking::encode_landmarks(1.0, &[[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]], &[], &mut bytes).unwrap();
+        assert_eq!(reader.read_binary(&bytes, &mut frame).unwrap_err().code, "no_hello");
+        reader.read(HELLO, &mut frame).unwrap();
+        assert_eq!(reader.read_binary(&bytes, &mut frame), Ok(PublishMessage::Frame));
+        let TrackingData::Landmarks { points, confidence } = &frame.data else { panic!("not landmarks") };
+        assert!(frame.t == 1.0 && points.len() == 2 && (points[1][1] - 4.0).abs() < 1e-4 && confidence.is_empty());
+        let before = frame.clone();
+        assert_eq!(reader.read_binary(&bytes, &mut frame).unwrap_err().code, "time_order", "the clock is that of the JSON frames");
+        bytes[4..12].copy_from_slice(&f64::NAN.to_le_bytes());
+        assert_eq!(reader.read_binary(&bytes, &mut frame).unwrap_err().code, "out_of_range");
+        assert_eq!(frame, before);
+        let mut weights_only = PublishReader::for_any_character();
+        weights_only.read(r#"{"type":"hello","version":1}"#, &mut frame).unwrap();
+        assert_eq!(weights_only.read_binary(&bytes, &mut frame).unwrap_err().code, "no_layout");
     }
 
     #[test]
@@ -500,6 +561,17 @@ mod tests {
                 "field takeover: invalid type: string \"yes\", expected true or false",
             ),
             (r#"{"type":"hello","version":1,"keep_neutral":1}"#, "wrong_type", "field keep_neutral"),
+            (r#"{"type":"hello","version":1,"slot":"a b"}"#, "out_of_range", "field slot is \"a b\", expected 1 to 64"),
+            (r#"{"type":"hello","version":1,"slot":5}"#, "wrong_type", "field slot"),
+            (
+                r#"{"type":"hello","version":1,"priority":101}"#,
+                "out_of_range",
+                "field priority is 101, expected a whole number from 0 to 100",
+            ),
+            (r#"{"type":"hello","version":1,"priority":1.5}"#, "out_of_range", "field priority is 1.5"),
+            (r#"{"type":"hello","version":1,"groups":["brows","ears"]}"#, "out_of_range", "field groups has \"ears\", expected brows"),
+            (r#"{"type":"hello","version":1,"groups":[]}"#, "out_of_range", "field groups is empty"),
+            (r#"{"type":"hello","version":1,"groups":"brows"}"#, "wrong_type", "field groups"),
         ] {
             let (mut reader, mut frame) = reader();
             let error = reader.read(text, &mut frame).expect_err(text);
