@@ -336,7 +336,8 @@ impl Solver {
         if let Some(zones) = &self.zones {
             zones.write(&shown.expressions, shown.bridge, &out.influences, &mut out.zones, &mut out.stretched);
         }
-        out.shapes = shown.weights;
+        // A blend adds what was and takes away what is no more: in between it may leave the range.
+        out.shapes = shown.weights.map(|weights| weights.map(|weight| weight.clamp(0.0, 1.0)));
         let [x, y, z, right, up, front] = shown.head;
         out.head = HeadPose {
             rotation: rotation::to_f32(rotation::from_vector(glam::DVec3::new(x, y, z))),

@@ -703,10 +703,11 @@ fn exports_hold_what_was_recorded() {
     while feed.next_frame(&mut frame).unwrap().is_some() {
         let (TrackingData::Weights { weights, head }, Some(expected)) = (&frame.data, shown[index].shapes) else { panic!("{frame:?}") };
         let worst = weights.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(expected.iter().all(|weight| (0.0..=1.0).contains(weight)), "{expected:?}");
         assert!(worst <= 0.5 / 255.0 + 1e-6, "{worst}");
         // Exact zeros say that the head is not sent.
         let turned = head.unwrap_or_default().rotation.angle_between(shown[index].head.rotation);
-        assert!(turned < 0.003, "{turned}");
+        assert!(turned < 0.0015, "{turned}");
         index += 1;
     }
     assert_eq!(index, frames.len());
@@ -733,7 +734,8 @@ fn exports_hold_what_was_recorded() {
     let rest = gltf::Gltf::from_slice(&glb).unwrap();
     let node = rest.nodes().find(|node| node.name() == Some(&character.bones[brow].joint)).unwrap();
     let at_rest = glam::Vec3::from(node.transform().decomposed().0);
-    let first = frames.partition_point(|frame| frame.t <= 2.0) - 1;
+    // The face that stands there: the one of 2.0 s arrives a little later.
+    let first = frames.partition_point(|frame| frame.t < 2.0) - 1;
     for (i, value) in values.enumerate() {
         // Below the head's joint, which turns nothing at rest: what the point does in head space.
         let moved = glam::Vec3::from(value) - at_rest;
