@@ -12,7 +12,7 @@ use crate::picture_size::parse_size;
 use crate::renderer::{Camera, DrawSettings, Headless, RenderError, RenderFrame, ViewMode};
 use crate::spectator::{Spectator, Status, StatusKind, WatchArgs};
 use crate::video::{Video, VideoError};
-use animation::{Animation, Palette};
+pub(crate) use animation::{Animation, Palette};
 use glam::Quat;
 use image::RgbaImage;
 use rhytid_shared::character::Drive;
@@ -93,7 +93,7 @@ const GONE_AFTER: Duration = Duration::from_millis(800);
 /// Nearer than the usual front view: small pictures shall show wrinkles. Tuned by eye.
 const CLOSE_UP: f32 = 0.74;
 /// Size of the pictures the palette is taken from, pixels; more only takes longer.
-const PALETTE_SIZE: [u32; 2] = [128, 128];
+pub(crate) const PALETTE_SIZE: [u32; 2] = [128, 128];
 /// How often a waiting film looks.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
 
@@ -206,27 +206,33 @@ impl Crew {
 
     /// The colours of this character: at rest, in each reference pose, and with its mouth open and its head turned.
     fn palette(&mut self) -> Result<Palette, RenderError> {
-        let rest = RenderFrame::at_rest(&self.character);
-        let num_bones = self.character.num_bones();
-        let mut frames = vec![rest.clone()];
-        for (k, pose) in self.character.poses.iter().enumerate() {
-            let mut frame = rest.clone();
-            frame.points.clone_from(&pose.points);
-            frame.influences[k * num_bones..(k + 1) * num_bones].fill(1.0);
-            frames.push(frame);
-        }
-        let mut frame = rest;
-        for (i, bone) in self.character.bones.iter().enumerate() {
-            let turns_with = bone.turns_with.map(|of| &self.character.bones[of].drive);
-            if let Drive::Jaw { max_angle, .. } = turns_with.unwrap_or(&bone.drive) {
-                frame.rotations[i] = Quat::from_rotation_x(0.7 * max_angle);
-            }
-        }
-        frame.head.rotation = Quat::from_rotation_y(0.3);
-        frames.push(frame);
+        let frames = colorful_frames(&self.character);
         let pictures = frames.iter().map(|frame| self.draw(frame, ViewMode::Beauty, PALETTE_SIZE)).collect::<Result<Vec<_>, _>>()?;
         Ok(Palette::of(&pictures))
     }
+}
+
+/// Faces that show the character's colours.
+pub(crate) fn colorful_frames(character: &Character) -> Vec<RenderFrame> {
+    let rest = RenderFrame::at_rest(character);
+    let num_bones = character.num_bones();
+    let mut frames = vec![rest.clone()];
+    for (k, pose) in character.poses.iter().enumerate() {
+        let mut frame = rest.clone();
+        frame.points.clone_from(&pose.points);
+        frame.influences[k * num_bones..(k + 1) * num_bones].fill(1.0);
+        frames.push(frame);
+    }
+    let mut frame = rest;
+    for (i, bone) in character.bones.iter().enumerate() {
+        let turns_with = bone.turns_with.map(|of| &character.bones[of].drive);
+        if let Drive::Jaw { max_angle, .. } = turns_with.unwrap_or(&bone.drive) {
+            frame.rotations[i] = Quat::from_rotation_x(0.7 * max_angle);
+        }
+    }
+    frame.head.rotation = Quat::from_rotation_y(0.3);
+    frames.push(frame);
+    frames
 }
 
 fn never_live(status: &Status) -> FilmError {

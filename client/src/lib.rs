@@ -11,7 +11,10 @@ mod native {
     pub use crate::link::{Link, LinkOptions, LinkState, LinkStats, ServerAddress};
     pub use crate::renderer::{Headless, RenderError};
     pub use crate::spectator::{Spectator, Status, StatusKind};
+    pub use crate::video::{Video, VideoError};
 }
+#[cfg(feature = "embedded")]
+mod apng;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod film;
 #[cfg(feature = "embedded")]
@@ -20,13 +23,15 @@ pub mod gallery;
 pub mod link;
 #[cfg(not(target_arch = "wasm32"))]
 mod picture_size;
+#[cfg(not(target_arch = "wasm32"))]
+mod remote;
 #[cfg(feature = "embedded")]
 pub mod render_cli;
 #[cfg(not(target_arch = "wasm32"))]
 mod sheet;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod spectator;
-#[cfg(feature = "embedded")]
+#[cfg(not(target_arch = "wasm32"))]
 mod video;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod view;
@@ -38,5 +43,3 @@ pub use asset::{AssetError, CharacterAsset};
 pub use native::*;
 pub use playout::{Playout, PlayoutState, PlayoutStats};
 pub use renderer::{BlendMode, Camera, Deformation, DrawSettings, RenderFrame, Renderer, ViewMode};
-#[cfg(feature = "embedded")]
-pub use video::{Video, VideoError};

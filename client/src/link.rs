@@ -11,6 +11,7 @@ mod tests;
 mod wire;
 
 pub use address::{AddressError, ServerAddress};
+pub(crate) use fetch::agent;
 pub use inbox::{FrameArrival, LinkNews};
 
 use backoff::Backoff;

@@ -1,6 +1,8 @@
 //! `render`: a feed file to pictures, the server's solve in this process. `still`: one picture of a pose.
 
+use crate::apng::Apng;
 use crate::asset::{AssetError, CharacterAsset};
+use crate::film::{Animation, PALETTE_SIZE, Palette, colorful_frames};
 use crate::picture_size::parse_size;
 use crate::renderer::{
     BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, Studio, ViewError, ViewMode, WrinkleSystem, ZoneBlend,
@@ -177,12 +179,18 @@ pub struct RenderArgs {
     #[arg(value_name = "FEED")]
     pub feed: PathBuf,
     /// Folder for the pictures, named by the index of their frame: 00000.png, …
-    #[arg(long, value_name = "DIR", required_unless_present = "mp4")]
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["mp4", "gif", "apng"])]
     pub out: Option<PathBuf>,
+    /// Write an animated GIF
+    #[arg(long, value_name = "FILE.gif")]
+    pub gif: Option<PathBuf>,
+    /// Write an animated PNG: all colours, more bytes
+    #[arg(long, value_name = "FILE.png")]
+    pub apng: Option<PathBuf>,
     /// Write a video, through ffmpeg
     #[arg(long, value_name = "FILE.mp4")]
     pub mp4: Option<PathBuf>,
-    /// Pictures a second in the video
+    /// Pictures a second in the video; a GIF and an animated PNG keep each picture's own time
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
     /// Draw every n-th frame; all are solved
@@ -276,6 +284,13 @@ impl PictureMaker {
         Ok(if self.supersample > 1 { averaged(&picture, self.supersample) } else { picture })
     }
 
+    /// The colours of what the settings show.
+    fn palette(&mut self) -> Result<Palette> {
+        let frames = colorful_frames(&self.asset.character);
+        let draw = |frame: &RenderFrame| self.headless.render(PALETTE_SIZE, &self.settings, frame);
+        Ok(Palette::of(&frames.iter().map(draw).collect::<std::result::Result<Vec<_>, _>>()?))
+    }
+
     fn draw(&mut self, frame: &FaceFrame, path: &Path) -> Result<()> {
         let picture = self.picture(frame)?;
         picture.save(path).map_err(|source| PictureError::Write { path: path.display().to_string(), source })
@@ -287,6 +302,8 @@ struct Output<'a> {
     args: &'a RenderArgs,
     maker: PictureMaker,
     video: Option<Video>,
+    gif: Option<(Animation, &'a Path)>,
+    apng: Option<(Apng, &'a Path)>,
     /// Time of the first frame and of the newest, seconds.
     times: Option<(f64, f64)>,
     /// Frames so far, and pictures.
@@ -295,13 +312,27 @@ struct Output<'a> {
 }
 
 impl<'a> Output<'a> {
-    fn open(args: &'a RenderArgs) -> Result<Self> {
-        let maker = PictureMaker::open(&args.picture)?;
+    /// `num_frames` counts the feed's frames, which an animated PNG must know before.
+    fn open(args: &'a RenderArgs, mut maker: PictureMaker, num_frames: impl FnOnce() -> Result<usize>) -> Result<Self> {
         if let Some(out) = &args.out {
             std::fs::create_dir_all(out).map_err(|source| PictureError::Io { path: out.display().to_string(), source })?;
         }
         let video = args.mp4.as_ref().map(|path| Video::create(path, args.picture.size, args.fps)).transpose()?;
-        Ok(Self { args, maker, video, times: None, index: 0, num_written: 0 })
+        let gif = match &args.gif {
+            Some(path) => {
+                Some((Animation::create(path, args.picture.size, maker.palette()?).map_err(|error| failed(path, &error))?, &**path))
+            }
+            None => None,
+        };
+        let apng = match &args.apng {
+            Some(path) => {
+                let num = num_frames()?.div_ceil(args.every as usize).min(args.limit.unwrap_or(usize::MAX));
+                let num = u32::try_from(num).ok().filter(|num| *num > 0).ok_or_else(|| failed(path, &"there are no pictures"))?;
+                Some((Apng::create(path, args.picture.size, num).map_err(|error| failed(path, &error))?, &**path))
+            }
+            None => None,
+        };
+        Ok(Self { args, maker, video, gif, apng, times: None, index: 0, num_written: 0 })
     }
 
     /// Draws the frame of time `t`, seconds, where its turn has come; false where there are enough pictures.
@@ -314,12 +345,19 @@ impl<'a> Output<'a> {
             return Ok(true);
         }
         let picture = self.maker.picture(frame)?;
+        let at = Duration::from_secs_f64((t - first).max(0.0));
         if let Some(video) = &mut self.video {
-            video.add(&picture, Duration::from_secs_f64((t - first).max(0.0)))?;
+            video.add(&picture, at)?;
         }
         if let Some(out) = &self.args.out {
             let path = out.join(format!("{index:05}.png"));
             picture.save(&path).map_err(|source| PictureError::Write { path: path.display().to_string(), source })?;
+        }
+        if let Some((gif, path)) = &mut self.gif {
+            gif.add(picture.clone(), at).map_err(|error| failed(path, &error))?;
+        }
+        if let Some((apng, path)) = &mut self.apng {
+            apng.add(picture, at).map_err(|error| failed(path, &error))?;
         }
         self.num_written += 1;
         Ok(self.args.limit.is_none_or(|limit| self.num_written < limit))
@@ -327,12 +365,24 @@ impl<'a> Output<'a> {
 
     /// Ends the video; gives the number of pictures.
     fn finish(self) -> Result<usize> {
+        let (first, last) = self.times.unwrap_or_default();
+        let end = Duration::from_secs_f64(last - first + 1.0 / self.args.fps);
         if let Some(video) = self.video {
-            let (first, last) = self.times.unwrap_or_default();
-            video.finish(Duration::from_secs_f64(last - first + 1.0 / self.args.fps))?;
+            video.finish(end)?;
+        }
+        if let Some((gif, path)) = self.gif {
+            gif.finish(end).map_err(|error| failed(path, &error))?;
+        }
+        if let Some((apng, path)) = self.apng {
+            apng.finish(end).map_err(|error| failed(path, &error))?;
         }
         Ok(self.num_written)
     }
+}
+
+/// An animation that could not be written.
+fn failed(path: &Path, problem: &dyn std::fmt::Display) -> PictureError {
+    PictureError::Io { path: path.display().to_string(), source: std::io::Error::other(problem.to_string()) }
 }
 
 /// Draws the frames of a feed, which are solved, or of a recording; returns how many pictures were written.
@@ -340,8 +390,16 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
     if args.feed.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("mcap")) {
         return render_recording(args);
     }
-    let mut output = Output::open(args)?;
-    let character = Arc::clone(&output.maker.asset.character);
+    let maker = PictureMaker::open(&args.picture)?;
+    let character = Arc::clone(&maker.asset.character);
+    let count = || {
+        let (mut feed, mut tracked, mut num) = (Feed::open(&args.feed, &character)?, TrackingFrame::default(), 0);
+        while let Some(item) = feed.next_frame(&mut tracked)? {
+            num += usize::from(item == FeedItem::Frame);
+        }
+        Ok(num)
+    };
+    let mut output = Output::open(args, maker, count)?;
     let path = args.feed.display().to_string();
     let num_frames = count_frames(&args.feed)?;
     let mut feed = Feed::open(&args.feed, &character)?;
@@ -388,12 +446,20 @@ fn render_recording(args: &RenderArgs) -> Result<usize> {
         return Err(PictureError::NoChoice);
     }
     let mut faces = Faces::new(Recording::open(&args.feed)?);
-    let mut output = Output::open(args)?;
-    let (recorded, given) = (faces.recording().character(), &output.maker.asset.character);
+    let maker = PictureMaker::open(&args.picture)?;
+    let (recorded, given) = (faces.recording().character(), &maker.asset.character);
     if recorded.sha256 != given.sha256 {
         let (path, recorded, given) = (args.feed.display().to_string(), recorded.name.clone(), given.name.clone());
         return Err(PictureError::OtherCharacter { path, recorded, given });
     }
+    let count = || {
+        let (mut faces, mut num) = (Faces::new(Recording::open(&args.feed)?), 0);
+        while faces.advance()?.is_some() {
+            num += 1;
+        }
+        Ok(num)
+    };
+    let mut output = Output::open(args, maker, count)?;
     let seconds = faces.recording().seconds();
     let progress = progress_bar((seconds * 1000.0) as u64);
     while let Some(moment) = faces.advance()? {

@@ -6,6 +6,7 @@ mod look;
 mod pages;
 mod painter;
 mod panel;
+mod play_bar;
 mod rates;
 mod switches;
 mod window;
@@ -14,6 +15,7 @@ pub(crate) use look::{ACCENT, FAINT, TEXT, apply as apply_look};
 pub(crate) use painter::Painter;
 
 use crate::asset::{AssetError, CharacterAsset};
+use crate::remote::Remote;
 use crate::renderer::{Deformation, RenderError, ViewError, ViewMode};
 use crate::spectator::{Spectator, StatusKind, WatchArgs};
 use hand::HandFace;
@@ -129,7 +131,9 @@ pub fn run(args: ViewArgs) -> Result<(), WindowError> {
     let proxy = event_loop.create_proxy();
     // The event loop is gone only when the window is.
     let wake = move || drop(proxy.send_event(Wake));
+    let remote = Remote::open(&args.watch.server, &args.watch.room, &args.watch.trust, wake.clone());
     let mut app = App {
+        remote,
         spectator: Spectator::open(args.watch, Arc::clone(&character), wake),
         switches,
         hand_face: HandFace::default(),
@@ -163,6 +167,8 @@ fn plain_words(error: &winit::error::EventLoopError) -> String {
 
 struct App {
     spectator: Spectator,
+    /// Of the room's player, where it has one.
+    remote: Remote,
     switches: Switches,
     hand_face: HandFace,
     /// The character drawn.
@@ -267,8 +273,10 @@ impl App {
         self.live_since = if status.kind == StatusKind::Live || is_by_hand { self.live_since.or(Some(now)) } else { None };
 
         let adapter = gpu.adapter_name().to_owned();
+        let known = self.remote.known();
         let scene = Scene {
             character,
+            known: &known,
             frame,
             streamed: &streamed,
             status: &status,
@@ -297,6 +305,7 @@ impl App {
             self.pictures += 1;
             // What the sliders were moved to while this picture was laid out shows in the next one.
             is_moving |= gpu.is_panel_moving() || switches.hand != hand;
+            switches.play_bar.words.drain(..).for_each(|word| self.remote.say(word));
         } else {
             is_moving = true;
         }

@@ -1,7 +1,15 @@
 //! `render` and `still` as a user runs them: the real program, a feed file, tiny pictures. Where there is no adapter they show
 //! as ignored.
 
+use image::AnimationDecoder;
 use libtest_mimic::{Arguments, Failed, Trial};
+use rhytid_server::feed::Feed;
+use rhytid_server::pipeline::Pipeline;
+use rhytid_server::recording::{RecordingWriter, SessionEvent};
+use rhytid_server::solve::SolveConfig;
+use rhytid_shared::packet::PacketLayout;
+use rhytid_shared::view::ViewHello;
+use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, TrackingFrame};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -12,6 +20,8 @@ fn main() {
     let trials = vec![
         drawn("every_tenth_frame_is_named_by_its_index", every_tenth_frame_is_named_by_its_index),
         drawn("limit_ends_after_so_many_pictures", limit_ends_after_so_many_pictures),
+        drawn("a_recording_is_drawn_as_its_packets_went_out", a_recording_is_drawn_as_its_packets_went_out),
+        drawn("animations_show_every_picture_in_its_time", animations_show_every_picture_in_its_time),
         drawn("views_show_different_things", views_show_different_things),
         drawn("two_processes_draw_the_same_bytes", two_processes_draw_the_same_bytes),
         drawn("a_neutral_is_kept_and_used_again", a_neutral_is_kept_and_used_again),
@@ -105,6 +115,71 @@ fn limit_ends_after_so_many_pictures() -> Result<(), Failed> {
     let out = folder("limit");
     check(&render(&feed(&out, None), &out, &["--every", "10", "--limit", "2"])?)?;
     assert_eq!(pictures(&out)?, ["00000.png", "00010.png"]);
+    Ok(())
+}
+
+/// A recording of what `feed` gives, beside it.
+fn recording(feed: &Path) -> Result<PathBuf, Failed> {
+    let path = feed.with_extension("mcap");
+    let character = std::sync::Arc::new(Character::from_glb(DEFAULT_CHARACTER_GLB)?);
+    let mut feed = Feed::open(feed, &character)?;
+    let mut pipeline = Pipeline::new(character.clone(), &SolveConfig::default(), &feed.hello, 1)?;
+    let mut writer = RecordingWriter::to(std::fs::File::create(&path)?, PacketLayout::from(&*character))?;
+    let character = Box::new(ViewHello::new("test", &character, String::new()).character);
+    writer.event(0, &SessionEvent::Recording { version: 1, room: "test".into(), server: "test".into(), character, clock: 0 })?;
+    let (mut frame, mut packet) = (TrackingFrame::default(), Vec::new());
+    while feed.next_frame(&mut frame)?.is_some() {
+        pipeline.frame(&frame, &mut packet)?;
+        writer.packet((frame.t * 1e9) as u64, packet.clone().into());
+    }
+    writer.finish()?;
+    Ok(path)
+}
+
+fn a_recording_is_drawn_as_its_packets_went_out() -> Result<(), Failed> {
+    let out = folder("recording");
+    let feed = feed(&out, None);
+    check(&render(&feed, &out.join("solved"), &["--every", "10"])?)?;
+    check(&render(&recording(&feed)?, &out.join("recorded"), &["--every", "10"])?)?;
+    assert_eq!(pictures(&out.join("recorded"))?, ["00000.png", "00010.png", "00020.png"]);
+    let open = |run: &str, name: &str| image::open(out.join(run).join(name)).map(|picture| picture.to_rgb8());
+    let mean = |a: &image::RgbImage, b: &image::RgbImage| {
+        let sum: u64 = a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+        sum as f64 / a.as_raw().len() as f64
+    };
+    for name in pictures(&out.join("solved"))? {
+        let off = mean(&open("solved", &name)?, &open("recorded", &name)?);
+        assert!(off < 0.2, "{name} is off by {off} codes: packets round");
+    }
+    assert!(mean(&open("recorded", "00000.png")?, &open("recorded", "00020.png")?) > 0.4, "the brows rise");
+    // A neutral changes nothing in packets.
+    let refused = render(&out.join("feed.mcap"), &out.join("x"), &["--save-calibration", "neutral.json"])?;
+    assert!(!refused.status.success() && stderr(&refused).contains("drawn as they are"), "{}", stderr(&refused));
+    Ok(())
+}
+
+fn animations_show_every_picture_in_its_time() -> Result<(), Failed> {
+    let out = folder("animations");
+    let take = recording(&feed(&out, None))?.display().to_string();
+    let [gif, apng, mp4] = ["face.gif", "face.png", "face.mp4"].map(|name| out.join(name).display().to_string());
+    check(&client(&["render", &take, "--gif", &gif, "--apng", &apng, "--every", "5", "--size", "64x64"])?)?;
+    let read = |path: &str| std::fs::File::open(path).map(std::io::BufReader::new);
+    let of_gif = image::codecs::gif::GifDecoder::new(read(&gif)?)?.into_frames().collect_frames()?;
+    let of_png = image::codecs::png::PngDecoder::new(read(&apng)?)?.apng()?.into_frames().collect_frames()?;
+    for frames in [&of_gif, &of_png] {
+        assert_eq!(frames.len(), 5, "frames 0, 5, 10, 15 and 20");
+        let millis: Vec<u32> = frames.iter().map(|frame| frame.delay().numer_denom_ms()).map(|(n, d)| n / d).collect();
+        assert!(millis[..4].iter().all(|millis| (190..=210).contains(millis)), "{millis:?}");
+        assert!(frames[0].buffer() != frames[4].buffer());
+    }
+    let video = client(&["render", &take, "--mp4", &mp4, "--size", "64x64", "--every", "5"])?;
+    if Command::new("ffmpeg").arg("-version").output().is_ok() {
+        check(&video)?;
+        let bytes = std::fs::read(&mp4)?;
+        assert!(bytes.len() > 500 && &bytes[4..8] == b"ftyp");
+    } else {
+        assert!(!video.status.success() && stderr(&video).contains("not installed"), "{}", stderr(&video));
+    }
     Ok(())
 }
 

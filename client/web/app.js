@@ -7,6 +7,7 @@ import { Puppet } from "./puppet.js";
 import { RoomPicker } from "./rooms.js";
 import { listenForCopies, showLinks } from "./share.js";
 import { Stage, expressionNames, fetchCharacter } from "./stage.js";
+import { Takes } from "./takes.js";
 import { byId, element, roomOfAddress, storage, wallClock } from "./util.js";
 import { ViewLink } from "./view_link.js";
 import { FaceViewer } from "./viewer.js";
@@ -37,6 +38,7 @@ const KEYS = [
   [["H"], "Controls"],
   [["P"], "Next page of the controls"],
   [["F"], "Full screen"],
+  [["Space"], "Replay: play and pause"],
   [["C"], "Camera: take this face as neutral"],
   [["X"], "Camera: this is straight ahead"],
   [["?"], "This list"],
@@ -58,7 +60,8 @@ let wrinklesBefore = "own";
 let blend = 0;
 const times = new PacketTimes();
 
-const panel = new Panel(["camera", "puppet", "inspect", "share"], (name) => shownTab(name));
+const takes = isBare ? null : new Takes();
+const panel = new Panel(["camera", "puppet", "inspect", "takes", "share"], (name) => shownTab(name));
 const inspector = new Inspector(byId("page-inspect"));
 const puppet = new Puppet(byId("page-puppet"), (t, sent) => inspector.frameSent(t, sent, sent));
 const picker = new RoomPicker((name) => enter(name, true));
@@ -69,6 +72,7 @@ function shownTab(/** @type {string | null} */ name) {
     inspector.setOpen(name === "inspect");
     if (name === "camera") openCamera();
     if (name === "share") showLinks(room);
+    takes?.setOpen(name === "takes");
   });
 }
 
@@ -112,6 +116,7 @@ function enter(name, isNew) {
   document.title = `${name} · Rhytid`;
   picker.current = name;
   puppet.enter(name);
+  takes?.enter(name);
   tellCamera({ type: "room", room: name });
   if (!byId("page-share").hidden) showLinks(name);
   link?.close();
@@ -343,6 +348,7 @@ function obey(key) {
   } else if (key === "f") toggleFullScreen();
   else if (key === "c") tellCamera({ type: "calibrate" });
   else if (key === "x") tellCamera({ type: "recentre" });
+  else if (key === " " && takes?.isReplaying) takes.toggle();
   else if (key === "?") byId("help").showModal();
   else return false;
   return true;
@@ -361,6 +367,8 @@ function listen() {
   addEventListener("keydown", (event) => {
     const target = /** @type {HTMLElement} */ (event.target);
     const isTyping = target.matches("select, textarea, input:not([type=range]):not([type=checkbox])");
+    // A button takes the space bar for itself.
+    if (event.key === " " && target.matches("button, summary, a, input")) return;
     if (isTyping || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
     if (obey(event.key.length === 1 ? event.key.toLowerCase() : event.key)) event.preventDefault();
   });
@@ -395,6 +403,7 @@ async function start() {
   document.title = `${room} · Rhytid`;
   picker.current = room;
   puppet.room = room;
+  takes?.enter(room);
   const canvas = byId("face");
   try {
     viewer = await FaceViewer.start(canvas, { backend: parameters.get("backend") ?? "auto", transparent: isTransparent });

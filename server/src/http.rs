@@ -191,9 +191,15 @@ async fn recordings(State(hub): State<Arc<Hub>>) -> Response {
 /// What a page can show of a folder of recordings.
 const MOST_LISTED: usize = 1000;
 
+/// What is played into the room, whether it is recorded, and whether it may be.
 async fn replay_status(State(hub): State<Arc<Hub>>, Path(room): Path<String>) -> Response {
     match room_name(&room) {
-        Ok(room) => axum::Json(serde_json::json!({ "replay": hub.players.status(&room) })).into_response(),
+        Ok(room) => {
+            let recording = hub.rooms.find(&room).and_then(|place| place.recording());
+            let may_record = hub.recorder.dir().is_some();
+            let status = serde_json::json!({ "replay": hub.players.status(&room), "recording": recording, "enabled": may_record });
+            axum::Json(status).into_response()
+        }
         Err(error) => error.response(StatusCode::BAD_REQUEST),
     }
 }

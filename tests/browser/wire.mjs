@@ -7,6 +7,7 @@ const load = (name) => import(pathToFileURL(path.join(web, name)).href);
 const { PacketTimes, encodePoints } = await load("wire.js");
 const { Backoff } = await load("util.js");
 const { PuppetFace } = await load("puppet_face.js");
+const { clockText, placeNow, sizeText } = await load("takes.js");
 const { SHAPES, label, mirrored } = await load("names.js");
 
 let numFailed = 0;
@@ -31,6 +32,13 @@ points.forEach((value, i) => {
 check("points come back within half a step", worst <= 0.51 * step && step < 0.01, `${worst} of ${step}`);
 const flat = new DataView(encodePoints(new Float32Array(9).fill(5), 0).buffer);
 check("points that are all one make a frame too", flat.getFloat32(24, true) > 0 && flat.getUint16(28, true) === 0);
+
+// The play bar.
+check("times are minutes and seconds", clockText(0) === "0:00.0" && clockText(75.26) === "1:15.3" && clockText(59.96) === "1:00.0");
+check("sizes are told in words", sizeText(10) === "1 kB" && sizeText(188_000) === "188 kB" && sizeText(2.5e9) === "2.50 GB");
+const replay = { position: 8, playing: true, speed: 2, loop: false, from: 1, to: 10 };
+check("a player goes on between two looks", placeNow(replay, 0.5) === 9 && placeNow({ ...replay, playing: false }, 5) === 8);
+check("it stops at its end, or begins again", placeNow(replay, 4) === 10 && placeNow({ ...replay, loop: true }, 4) === 7);
 
 // Heads of packets.
 const times = new PacketTimes();

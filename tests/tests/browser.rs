@@ -67,6 +67,7 @@ fn main() -> ExitCode {
         trial("webgl2_draws_what_the_native_client_draws", can_draw, || compare("webgl")),
         trial("webgpu_draws_what_the_native_client_draws", can_draw, || compare("webgpu")),
         trial("the_page_does_what_it_says", lack.is_none(), the_page_does_what_it_says),
+        trial("the_page_records_and_replays", lack.is_none(), the_page_records_and_replays),
         trial("the_page_survives_the_server", lack.is_none(), the_page_survives_the_server),
         trial("a_face_before_the_camera_moves_another_pages_picture", can_track, || with_film("camera.mjs")),
         trial("the_camera_page_fits_a_performer", can_track, || with_film("wizard.mjs")),
@@ -256,6 +257,18 @@ impl Difference {
 fn the_page_does_what_it_says() -> Result<()> {
     let server = Server::start();
     script("page.mjs", Some(&server), &[])
+}
+
+fn the_page_records_and_replays() -> Result<()> {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("takes");
+    // What a run before has left.
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder)?;
+    let server = Server::with(|config| {
+        config.record.dir = Some(folder.clone());
+        config.record.rooms = vec!["none".into()];
+    });
+    script("takes.mjs", Some(&server), &[])
 }
 
 /// Runs a script that shows the film to the browser's camera.

@@ -25,7 +25,7 @@ const MAX_WAITING: usize = 4;
 
 /// The colours of a film.
 #[derive(Debug, Clone)]
-pub(super) struct Palette {
+pub(crate) struct Palette {
     /// `NUM_COLORS` times red, green, blue, sRGB-encoded.
     colors: Vec<[u8; 3]>,
     /// Nearest entry of a colour of `LOOK_UP_BITS` a channel, once somebody asked.
@@ -34,7 +34,7 @@ pub(super) struct Palette {
 
 impl Palette {
     /// Colours for pictures like these.
-    pub(super) fn of(pictures: &[RgbaImage]) -> Self {
+    pub(crate) fn of(pictures: &[RgbaImage]) -> Self {
         let samples: Vec<u8> = pictures.iter().flat_map(|picture| picture.pixels()).flat_map(|pixel| pixel.0).collect();
         // Learning from a third of the pixels is enough and takes 50 ms.
         let colors = color_quant::NeuQuant::new(3, NUM_COLORS, &samples).color_map_rgb();
@@ -73,14 +73,14 @@ impl Palette {
 }
 
 /// A GIF being written, on a thread of its own.
-pub(super) struct Animation {
+pub(crate) struct Animation {
     pictures: SyncSender<(RgbaImage, Duration)>,
     writer: JoinHandle<Result<Writer, EncodingError>>,
 }
 
 impl Animation {
     /// Begins the file at `path`; pictures have `size`.
-    pub(super) fn create(path: &Path, size: [u32; 2], palette: Palette) -> Result<Self, EncodingError> {
+    pub(crate) fn create(path: &Path, size: [u32; 2], palette: Palette) -> Result<Self, EncodingError> {
         let mut writer = Writer::create(path, size, palette)?;
         let (pictures, waiting) = sync_channel::<(RgbaImage, Duration)>(MAX_WAITING);
         let writer = std::thread::spawn(move || {
@@ -93,13 +93,13 @@ impl Animation {
     }
 
     /// Adds the picture of `at`, counted from the beginning.
-    pub(super) fn add(&mut self, picture: RgbaImage, at: Duration) -> Result<(), EncodingError> {
+    pub(crate) fn add(&mut self, picture: RgbaImage, at: Duration) -> Result<(), EncodingError> {
         // The writer hangs up when it failed; `finish` tells why.
         self.pictures.send((picture, at)).map_err(|_| EncodingError::from(std::io::Error::other("the file could not be written")))
     }
 
     /// Ends the file; the last picture is shown until `at`.
-    pub(super) fn finish(self, at: Duration) -> Result<(), EncodingError> {
+    pub(crate) fn finish(self, at: Duration) -> Result<(), EncodingError> {
         drop(self.pictures);
         let writer = self.writer.join().map_err(|_| EncodingError::from(std::io::Error::other("the encoder panicked")))??;
         writer.finish(at)

@@ -35,7 +35,7 @@ impl ServerAddress {
     }
 
     /// A path on the same server over HTTP. `path` must begin with a slash.
-    pub(super) fn http_url(&self, path: &str) -> String {
+    pub(crate) fn http_url(&self, path: &str) -> String {
         format!("{}://{}:{}{path}", if self.is_encrypted { "https" } else { "http" }, self.host, self.port)
     }
 

@@ -36,6 +36,12 @@ fn tls(trust: &Trust) -> TlsConfig {
     }
 }
 
+/// Straight to the server as the socket goes: no proxy from the environment, no redirect to elsewhere. Carries no secrets: see [`tls`].
+pub(crate) fn agent(trust: &Trust, timeout: Duration) -> ureq::Agent {
+    let config = ureq::Agent::config_builder().timeout_global(Some(timeout)).proxy(None).max_redirects(0);
+    ureq::Agent::new_with_config(config.tls_config(tls(trust)).build())
+}
+
 /// The `.glb` at `path` of `server`. It is what `sha256` says, or an error.
 pub(super) fn character(server: &super::ServerAddress, trust: &Trust, path: &str, sha256: &str) -> Result<Vec<u8>, FetchError> {
     // "//host" would be somewhere else.
@@ -43,11 +49,7 @@ pub(super) fn character(server: &super::ServerAddress, trust: &Trust, path: &str
         return Err(FetchError::Path { got: path.chars().take(80).collect() });
     }
     let url = server.http_url(path);
-    // Straight to the server as the socket goes: no proxy from the environment, no redirect to elsewhere.
-    let agent = ureq::Agent::new_with_config(
-        ureq::Agent::config_builder().timeout_global(Some(TIMEOUT)).proxy(None).max_redirects(0).tls_config(tls(trust)).build(),
-    );
-    let bytes = agent
+    let bytes = agent(trust, TIMEOUT)
         .get(&url)
         .call()
         .and_then(|mut response| response.body_mut().with_config().limit(MAX_CHARACTER_BYTES as u64).read_to_vec())

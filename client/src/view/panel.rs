@@ -1,11 +1,12 @@
 //! What stands round the face: status, switches, numbers, coefficients.
 
 use super::look::{self, ACCENT, BAD, FAINT, GOOD, PANEL, TEXT, WARN, WELL};
-use super::pages;
 use super::rates::Rate;
 use super::switches::{Page, Switches, views};
+use super::{pages, play_bar};
 use crate::link::LinkStats;
 use crate::playout::PlayoutStats;
+use crate::remote::Known;
 use crate::renderer::{BlendMode, Deformation, RenderFrame, ViewMode};
 use crate::spectator::{Status, StatusKind};
 use egui::{Align2, Color32, CornerRadius, FontId, Frame, Margin, Pos2, Rect, RichText, Sense, Ui, pos2, vec2};
@@ -19,6 +20,8 @@ const BARS_HEIGHT: f32 = 24.0;
 /// What the panel shows. Changes nothing but the switches.
 pub(crate) struct Scene<'a> {
     pub(crate) character: &'a Character,
+    /// What is played into the room and recorded of it.
+    pub(crate) known: &'a Known,
     /// What is drawn.
     pub(crate) frame: &'a RenderFrame,
     /// What the stream shows.
@@ -59,6 +62,7 @@ pub(crate) fn show(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) -> R
             });
         });
     }
+    play_bar::show(ui, scene.known, &mut switches.play_bar);
     egui::CentralPanel::no_frame().show(ui, |ui| face(ui, scene, switches)).inner
 }
 
@@ -162,6 +166,7 @@ fn contents(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) {
             deformation_switches(ui, scene, switches);
             look::section(ui, "Link");
             numbers(ui, scene);
+            play_bar::record(ui, scene.known, &mut switches.play_bar);
             look::section(ui, "Reference poses");
             for (k, pose) in scene.character.poses.iter().enumerate() {
                 pose_bars(ui, scene, k, &pose.name);
@@ -333,6 +338,6 @@ fn pose_bars(ui: &mut Ui, scene: &Scene<'_>, k: usize, name: &str) {
 }
 
 fn key_help(ui: &mut Ui) {
-    let text = "1–6 view   W wrinkles   Z whose   B blend\nD deform   E by hand   L light   P page   H panel\nF full screen   R camera   Esc quit\nDrag to turn, wheel to zoom";
+    let text = "1–6 view   W wrinkles   Z whose   B blend\nD deform   E by hand   L light   P page   H panel\nF full screen   R camera   Esc quit\nSpace: replay, play and pause\nDrag to turn, wheel to zoom";
     ui.label(RichText::new(text).small().color(FAINT));
 }

@@ -1,6 +1,7 @@
 //! What the person before the window has chosen.
 
 use super::hand::Hand;
+use super::play_bar::PlayBar;
 use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, Studio, ViewMode, WrinkleSystem};
 use egui::{Key, Modifiers};
 use rhytid_shared::Character;
@@ -16,6 +17,8 @@ pub(crate) struct Switches {
     pub(crate) hand: Hand,
     /// What the lower part of the panel shows.
     pub(crate) page: Page,
+    /// What the player of a recording shall do.
+    pub(crate) play_bar: PlayBar,
     /// The panel is there.
     pub(crate) has_panel: bool,
     /// The window fills the screen.
@@ -69,6 +72,7 @@ impl Switches {
             pose: None,
             hand: Hand::default(),
             page: Page::Face,
+            play_bar: PlayBar::default(),
             has_panel: true,
             is_full_screen: false,
             is_quitting: false,

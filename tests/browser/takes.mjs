@@ -1,0 +1,115 @@
+// Recordings: the page makes one, plays it into another room, and its play bar stops, seeks and goes on.
+import { check, difference, faceIsThere, launch, live, open, picture, roomName, run, text, until } from "./lib.mjs";
+
+await run(async () => {
+  const browser = await launch();
+  const [room, stage] = [roomName("take"), roomName("stage")];
+
+  // A face that is moved by hand.
+  const { page, errors } = await open(browser, `/?room=${room}`, { size: { width: 1280, height: 720 } });
+  await faceIsThere(page);
+  if (!(await page.isVisible("#panel"))) await page.keyboard.press("h");
+  await page.click("#tab-puppet");
+  await page.locator("#slider-shape-browInnerUp").fill("0.01");
+  await live(page);
+  await until("the record button", () => page.isVisible("#record-button"));
+  check("nothing is recorded at first", (await page.getAttribute("#record-button", "aria-pressed")) === "false");
+  await page.click("#record-button");
+  await until("the recording", async () => (await page.getAttribute("#record-button", "aria-pressed")) === "true");
+  check("the button says that it records", true);
+  await page.waitForTimeout(2500);
+  await page.locator("#slider-shape-browInnerUp").fill("1");
+  await page.locator("#slider-shape-jawOpen").fill("0.8");
+  await page.waitForTimeout(2500);
+  await page.click("#tab-takes");
+  await until("the recording's length", async () => /^Recording: 0:0\d\.\d, \d+ kB$/.test(await text(page, "#take-text")));
+  check("the page of takes says how long it is", true);
+  await page.click("#take-button");
+  await until("the end of the recording", async () => (await page.getAttribute("#record-button", "aria-pressed")) === "false");
+  const file = await until("a recording in the list", () => page.getAttribute("#take-list [data-file]", "data-file"));
+  check("its file is named after the room", file.startsWith(`${room}-`), file);
+  // In the room itself the performer is in the way, and the page says so.
+  await page.click(`#take-list [data-file="${file}"]`);
+  await until("a refusal in words", async () => (await text(page, "#take-problem")).includes("publisher already"));
+  check("a room with a publisher is not taken over", !(await page.isVisible("#play")));
+  // A refusal is an answer of 409, which browsers call an error.
+  const others = errors.filter((error) => !error.includes("409"));
+  check("the console says nothing else", others.length === 0, others.join("; "));
+  await page.close();
+
+  // Another room, where it is played.
+  const watching = await open(browser, `/?room=${stage}&bare=1`);
+  await faceIsThere(watching.page);
+  check("a bare page has no play bar", !(await watching.page.isVisible("#play")));
+  const player = await open(browser, `/?room=${stage}`, { size: { width: 1280, height: 720 } });
+  await faceIsThere(player.page);
+  check("nothing is replayed at first", !(await player.page.isVisible("#play")));
+  if (!(await player.page.isVisible("#panel"))) await player.page.keyboard.press("h");
+  await player.page.click("#tab-takes");
+  await player.page.click(`#take-list [data-file="${file}"]`);
+  await until("the play bar", () => player.page.isVisible("#play"));
+  await live(watching.page);
+  check("the other page's face is live", true);
+
+  const place = async () => Number(await player.page.locator("#play-position").inputValue());
+  const length = Number(await player.page.getAttribute("#play-position", "max"));
+  check(`the recording is as long as it took (${length.toFixed(1)} s)`, length > 4.5 && length < 60);
+  // To its end, where the player stays.
+  await until("the end", async () => (await player.page.getAttribute("#play", "data-playing")) === "false");
+  check("it stands still at its end", Math.abs((await place()) - length) < 0.1, String(await place()));
+
+  // Scrubbing.
+  const scrub = async (fraction) => {
+    const box = await player.page.locator("#play-position").boundingBox();
+    await player.page.mouse.move(box.x + box.width * 0.5, box.y + box.height / 2);
+    await player.page.mouse.down();
+    await player.page.mouse.move(box.x + box.width * (fraction + 0.5) / 2, box.y + box.height / 2);
+    await player.page.mouse.move(box.x + 8 + (box.width - 16) * fraction, box.y + box.height / 2);
+    await player.page.mouse.up();
+    await player.page.waitForTimeout(300);
+  };
+  const status = async () => (await (await player.page.request.get(new URL(`/api/rooms/${stage}/replay`, player.page.url()).href)).json()).replay;
+  await scrub(0.95);
+  const raised = await until("the late face", async () => Math.abs((await status()).position - 0.95 * length) < 0.1 * length && picture(watching.page));
+  await watching.page.waitForTimeout(1500);
+  const late = await picture(watching.page);
+  await scrub(0.2);
+  check("the player stands where the slider was dragged to", Math.abs((await status()).position - 0.2 * length) < 0.06 * length, JSON.stringify(await status()));
+  check("it stands still, as before", (await status()).playing === false);
+  await until("the early face in the other page's picture", async () => difference(late, await picture(watching.page), [0.2, 0, 0.8, 1]) > 0.5, 40_000);
+  check("dragging shows another face to whoever watches", raised !== null);
+
+  // Play, speed, again and again, and the space bar.
+  await player.page.selectOption("#play-speed", "0.25");
+  await player.page.click("#play-button");
+  await until("it to move", async () => (await status()).playing && (await status()).speed === 0.25);
+  const before = await place();
+  await player.page.waitForTimeout(2000);
+  const moved = (await place()) - before;
+  check(`a quarter of the speed moves the slider by a quarter (${moved.toFixed(2)} s in 2 s)`, moved > 0.3 && moved < 0.9);
+  await player.page.click("#play-loop");
+  await until("again and again", async () => (await status()).loop);
+  await player.page.locator("#face").focus();
+  await player.page.keyboard.press(" ");
+  await until("a stop by the space bar", async () => !(await status()).playing);
+  check("the space bar stops it", (await player.page.getAttribute("#play-button", "aria-label")) === "Play");
+  await player.page.locator("#play-position").focus();
+  await player.page.keyboard.press("Home");
+  await until("the beginning", async () => (await status()).position < 0.05);
+  check("the slider obeys keys", true);
+  if (process.env.RHYTID_SHOTS) await player.page.screenshot({ path: `${process.env.RHYTID_SHOTS}/takes.png` });
+  await player.page.click("#play-end");
+  await until("the bar gone", async () => !(await player.page.isVisible("#play")));
+  await until("the other page's face gone", async () => (await text(watching.page, "#state-text")) !== "Live");
+  check("the replay ends", (await status()) === null);
+  check("these pages' consoles say nothing of errors", player.errors.length + watching.errors.length === 0, [...player.errors, ...watching.errors].join("; "));
+
+  const phone = await open(browser, `/?room=${stage}`, { size: { width: 390, height: 844 } });
+  await faceIsThere(phone.page);
+  await phone.page.request.post(new URL(`/api/rooms/${stage}/replay`, phone.page.url()).href, { data: { file, loop: true } });
+  await until("the play bar on a phone", () => phone.page.isVisible("#play"));
+  const fits = await phone.page.evaluate(() => [...document.querySelectorAll("#play *")].every((part) => part.getBoundingClientRect().right <= innerWidth) && document.documentElement.scrollWidth <= innerWidth);
+  check("the play bar fits a phone", fits);
+  if (process.env.RHYTID_SHOTS) await phone.page.screenshot({ path: `${process.env.RHYTID_SHOTS}/takes-phone.png` });
+  await browser.close();
+});
