@@ -399,7 +399,6 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
         }
         Ok(num)
     };
-    let mut output = Output::open(args, maker, count)?;
     let path = args.feed.display().to_string();
     let num_frames = count_frames(&args.feed)?;
     let mut feed = Feed::open(&args.feed, &character)?;
@@ -407,6 +406,7 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
         Some(path) => start_calibrated(&character, &feed.hello, path)?,
         None => Solver::new(Arc::clone(&character), &SolveConfig::default(), &feed.hello)?,
     };
+    let mut output = Output::open(args, maker, count)?;
 
     let progress = progress_bar(num_frames);
     let mut tracked = TrackingFrame::default();
