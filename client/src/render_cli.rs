@@ -269,7 +269,7 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
     let (mut index, mut num_written) = (0_usize, 0);
     while let Some(item) = feed.next_frame(&mut tracked)? {
         match item {
-            FeedItem::Calibrate => solver.calibrate(),
+            FeedItem::Command(command) => solver.command(&command)?,
             FeedItem::Frame => {
                 solver.solve(&tracked, &mut solved).map_err(|source| PictureError::Frame {
                     path: path.clone(),

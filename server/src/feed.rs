@@ -2,7 +2,7 @@
 
 use crate::trackers::livelink_csv::LiveLinkCsv;
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
-use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
+use rhytid_shared::{Character, Command, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -31,12 +31,12 @@ pub enum FeedError {
 }
 
 /// What stands on a line after the hello.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum FeedItem {
     /// A frame, written into the buffer given.
     Frame,
-    /// Take the neutral face now.
-    Calibrate,
+    /// What the publisher asked for between two frames.
+    Command(Command),
 }
 
 /// The lines of a feed file, whatever it is on the disk.
@@ -100,10 +100,7 @@ impl<R: BufRead> Feed<R> {
         }
         match self.read(frame)? {
             PublishMessage::Frame => Ok(Some(FeedItem::Frame)),
-            PublishMessage::Calibrate => Ok(Some(FeedItem::Calibrate)),
-            PublishMessage::Settings(_) | PublishMessage::Recentre => {
-                Err(self.refuse(MessageError::new("unknown_type", "a feed has frames and \"calibrate\" only; settings go into its hello")))
-            }
+            PublishMessage::Command(command) => Ok(Some(FeedItem::Command(command))),
             PublishMessage::Hello(_) => Err(self.refuse(MessageError::new("repeated_hello", "a feed has one hello, its first line"))),
         }
     }

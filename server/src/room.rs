@@ -3,6 +3,7 @@
 use crate::metrics::Metrics;
 use crate::solve::Calibration;
 use crate::solve::mix::Mixer;
+use crate::source::Control;
 use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
 use rhytid_shared::{ChannelGroup, Character, FaceFrame, PublishHello, RoomName, Slot};
@@ -10,7 +11,7 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
-use tokio::sync::{oneshot, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_tungstenite::tungstenite::{Bytes, Utf8Bytes};
 
 /// The newest state of a room, shared by all its viewers.
@@ -147,6 +148,7 @@ struct Publisher {
     claim: SlotClaim,
     since: Instant,
     evict: oneshot::Sender<()>,
+    controls: mpsc::Sender<Control>,
 }
 
 /// A room as `/api/rooms` lists it.
@@ -226,8 +228,8 @@ impl Rooms {
     }
 
     /// Enters a room as a source, in place of the one in its slot where the claim says so. What comes with the place says when
-    /// another takes it.
-    pub fn claim(&self, name: &RoomName, claim: SlotClaim) -> Result<(Publishing, Evicted), RoomError> {
+    /// another takes it; others reach it through `controls`.
+    pub fn claim(&self, name: &RoomName, claim: SlotClaim, controls: mpsc::Sender<Control>) -> Result<(Publishing, Evicted), RoomError> {
         let mut by_name = lock(&self.by_name);
         let room = self.find_or_make(&mut by_name, name)?;
         let mut state = lock(&room.state);
@@ -247,7 +249,7 @@ impl Rooms {
             state.mixer.leave(before.session);
         }
         state.mixer.enter(session, &claim.slot);
-        state.publishers.push(Publisher { session, claim, since: Instant::now(), evict });
+        state.publishers.push(Publisher { session, claim, since: Instant::now(), evict, controls });
         drop(state);
         if let Some(before) = before {
             // Its task may have ended in this moment; then nobody needs to be told.
@@ -292,9 +294,14 @@ impl Rooms {
         Ok(room)
     }
 
+    /// The room of this name.
+    pub fn find(&self, name: &RoomName) -> Option<Arc<Room>> {
+        lock(&self.by_name).get(name).cloned()
+    }
+
     /// The neutral face that the room keeps, for the slot of `hello`, of its tracker.
     pub fn neutral(&self, name: &RoomName, hello: &PublishHello) -> Option<Calibration> {
-        let room = lock(&self.by_name).get(name).cloned()?;
+        let room = self.find(name)?;
         let state = lock(&room.state);
         state.neutrals.get(&hello.slot.name).filter(|kept| kept.hello.is_of_same_tracker(hello)).map(|kept| kept.calibration.clone())
     }
@@ -320,6 +327,12 @@ impl Room {
     /// Seconds on the mixer's clock.
     fn now(&self) -> f64 {
         self.since.elapsed().as_secs_f64()
+    }
+
+    /// Where commands to the source in this slot go.
+    pub fn controls(&self, slot: &str) -> Option<mpsc::Sender<Control>> {
+        let state = lock(&self.state);
+        state.publishers.iter().find(|publisher| publisher.claim.slot.name == slot).map(|publisher| publisher.controls.clone())
     }
 
     fn listing(&self) -> RoomListing {
@@ -457,6 +470,11 @@ mod tests {
         Rooms::new(character, max_rooms, max_viewers, Arc::new(Metrics::new()))
     }
 
+    /// Claims a slot that nobody commands.
+    fn claim(rooms: &Rooms, name: &RoomName, claim: SlotClaim) -> Result<(Publishing, Evicted), RoomError> {
+        rooms.claim(name, claim, mpsc::channel(1).0)
+    }
+
     fn main(source: &str, takeover: bool) -> SlotClaim {
         SlotClaim { source: source.into(), takeover, ..SlotClaim::default() }
     }
@@ -469,10 +487,10 @@ mod tests {
     fn slots_are_taken_one_by_one() {
         let rooms = rooms(10, 10);
         let room = name("a");
-        let mut places: Vec<_> = (0..MAX_SLOTS).map(|i| rooms.claim(&room, slot(&format!("s{i}"), false)).unwrap()).collect();
-        assert_eq!(rooms.claim(&room, slot("more", false)).err(), Some(RoomError::TooManySlots { most: 8 }));
-        assert_eq!(rooms.claim(&room, slot("s3", false)).err(), Some(RoomError::SlotTaken));
-        let again = rooms.claim(&room, slot("s3", true)).unwrap();
+        let mut places: Vec<_> = (0..MAX_SLOTS).map(|i| claim(&rooms, &room, slot(&format!("s{i}"), false)).unwrap()).collect();
+        assert_eq!(claim(&rooms, &room, slot("more", false)).err(), Some(RoomError::TooManySlots { most: 8 }));
+        assert_eq!(claim(&rooms, &room, slot("s3", false)).err(), Some(RoomError::SlotTaken));
+        let again = claim(&rooms, &room, slot("s3", true)).unwrap();
         assert_eq!(places[3].1.try_recv(), Ok(()), "it is told");
         assert!(places[2].1.try_recv().is_err(), "and nobody else");
         assert_eq!(rooms.metrics.publishers.get(), 8);
@@ -491,15 +509,15 @@ mod tests {
     #[test]
     fn a_room_has_one_publisher_and_takeover_replaces_it() {
         let rooms = rooms(10, 10);
-        let (first, mut evicted) = rooms.claim(&name("a"), main("one", false)).unwrap();
-        assert_eq!(rooms.claim(&name("a"), main("two", false)).err(), Some(RoomError::Taken));
-        let (second, _evicted) = rooms.claim(&name("a"), main("two", true)).unwrap();
+        let (first, mut evicted) = claim(&rooms, &name("a"), main("one", false)).unwrap();
+        assert_eq!(claim(&rooms, &name("a"), main("two", false)).err(), Some(RoomError::Taken));
+        let (second, _evicted) = claim(&rooms, &name("a"), main("two", true)).unwrap();
         assert_eq!((first.session, second.session), (1, 2));
         assert_eq!(evicted.try_recv(), Ok(()));
         drop(first);
-        assert_eq!(rooms.claim(&name("a"), main("three", false)).err(), Some(RoomError::Taken), "the old one's end frees nothing");
+        assert_eq!(claim(&rooms, &name("a"), main("three", false)).err(), Some(RoomError::Taken), "the old one's end frees nothing");
         drop(second);
-        assert_eq!(rooms.claim(&name("a"), main("three", false)).unwrap().0.session, 3);
+        assert_eq!(claim(&rooms, &name("a"), main("three", false)).unwrap().0.session, 3);
         assert_eq!(rooms.metrics.publishers.get(), 0);
     }
 
@@ -510,7 +528,7 @@ mod tests {
         let rooms = rooms(1, 1);
         let text = include_str!("../../shared/assets/demo.ibug68.jsonl");
         let mut feed = crate::feed::Feed::new(std::io::Cursor::new(text), "demo".into(), &rooms.character).unwrap();
-        let (place, _evicted) = rooms.claim(&name("a"), SlotClaim::of(&feed.hello)).unwrap();
+        let (place, _evicted) = claim(&rooms, &name("a"), SlotClaim::of(&feed.hello)).unwrap();
         let mut pipeline = Pipeline::new(rooms.character.clone(), &SolveConfig::default(), &feed.hello, place.session).unwrap();
         let (mut frame, mut packet) = (rhytid_shared::TrackingFrame::default(), Vec::new());
         for _ in 0..120 {
@@ -527,7 +545,7 @@ mod tests {
         let rooms = rooms(2, 1);
         let viewer = rooms.join(&name("a")).unwrap();
         assert_eq!(rooms.join(&name("a")).err(), Some(RoomError::TooManyViewers { most: 1 }));
-        let publisher = rooms.claim(&name("b"), main("", false)).unwrap();
+        let publisher = claim(&rooms, &name("b"), main("", false)).unwrap();
         assert_eq!(rooms.join(&name("c")).err(), Some(RoomError::TooManyRooms { most: 2 }));
         rooms.sweep(Duration::ZERO);
         assert_eq!((rooms.list().len(), rooms.metrics.rooms.get(), rooms.metrics.viewers.get()), (2, 2, 1));

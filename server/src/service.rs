@@ -3,6 +3,7 @@
 use crate::config::{Limits, ServerConfig, ServerConfigError, seconds};
 use crate::http::router;
 use crate::metrics::Metrics;
+use crate::profiles::{ProfileError, Profiles};
 use crate::room::Rooms;
 use crate::socket::{ErrorMessage, say_and_close};
 use crate::stream::{TimedStream, Wire};
@@ -61,6 +62,9 @@ pub enum ServerError {
         /// What is wrong with it.
         source: CharacterError,
     },
+    /// The folder of profiles cannot be used.
+    #[error(transparent)]
+    Profiles(#[from] ProfileError),
     /// There is no certificate.
     #[error(transparent)]
     Tls(#[from] TlsError),
@@ -89,6 +93,7 @@ pub(crate) struct Hub {
     pub layout: PacketLayout,
     pub rooms: Rooms,
     pub trackers: Trackers,
+    pub profiles: Arc<Profiles>,
     pub metrics: Arc<Metrics>,
     pub listens_on_loopback: bool,
     /// True once the service ends.
@@ -142,6 +147,7 @@ pub async fn run(
     for spec in &config.vmc_out {
         outs.push(VmcOut::bind(spec).await?);
     }
+    let profiles = Profiles::load(config.profiles.as_deref())?;
     let metrics = Arc::new(Metrics::new());
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
@@ -151,6 +157,7 @@ pub async fn run(
         layout: PacketLayout::from(&*character),
         rooms: Rooms::new(character.clone(), config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
         trackers: Trackers::default(),
+        profiles: Arc::new(profiles),
         listens_on_loopback: address.ip().is_loopback(),
         character,
         glb: glb.into(),

@@ -475,6 +475,7 @@ fn a_recording_of_live_link_face_is_a_feed() {
         repeats: false,
         takeover: false,
         binary: false,
+        profile: None,
         timeout: Duration::from_secs(10),
         trust: Trust::Public,
     };
