@@ -1,6 +1,7 @@
 //! The guided fit on the default character: performers whose faces go less far than the character's, to another side, or drift.
 
-#[allow(dead_code, reason = "other tests use the rest of it")]
+#![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
+
 mod solve_fixture;
 
 use glam::Vec3;
