@@ -413,13 +413,7 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
     let mut solved = FaceFrame::at_rest(&character);
     while let Some(item) = feed.next_frame(&mut tracked)? {
         match item {
-            FeedItem::Calibrate => solver.calibrate(),
-            FeedItem::Settings(change) => {
-                solver.set(&change).map_err(|source| PictureError::Frame { path: path.clone(), line: feed.line(), source })?;
-            }
-            FeedItem::Recentre => {
-                solver.recentre();
-            }
+            FeedItem::Command(command) => solver.command(&command)?,
             FeedItem::Frame => {
                 solver.solve(&tracked, &mut solved).map_err(|source| PictureError::Frame {
                     path: path.clone(),

@@ -20,6 +20,7 @@ const HOLD = 1.5;
 const PATIENCE = 4000;
 
 const OFFERS = {
+  mirror: "Your mouth went to the other side than asked: mirror the picture",
   swap_jaw: "Your jaw went to the other side than asked: swap its left and right",
   swap_mouth: "Your mouth went to the other side than asked: swap its left and right",
 };
@@ -167,7 +168,7 @@ export class Wizard {
     byId("wizard-title").textContent = "Done";
     /** @type {Map<string, HTMLInputElement>} */
     const boxes = new Map();
-    const offered = Object.entries(offers).filter(([, isOffered]) => isOffered).map(([name]) => {
+    const offered = Object.entries(offers).filter(([name]) => name in OFFERS).map(([name]) => {
       const box = element("input", { type: "checkbox", checked: true });
       boxes.set(name, box);
       return element("label", { class: "check" }, box, OFFERS[/** @type {keyof typeof OFFERS} */ (name)] ?? name);
@@ -178,7 +179,8 @@ export class Wizard {
       ...offered);
     this.#buttons(
       ["Use it", () => {
-        if (boxes.size) this.host.apply(Object.fromEntries([...boxes].map(([name, box]) => [name, box.checked])));
+        const agreed = [...boxes].filter(([, box]) => box.checked).map(([name]) => [name, offers[name]]);
+        if (agreed.length) this.host.apply(Object.fromEntries(agreed));
         this.close();
       }, true],
       ["Save as a file", () => this.host.save(profile)],

@@ -60,6 +60,8 @@ pub struct ServerConfig {
     pub listen_udp: Vec<ListenSpec>,
     /// Where rooms' faces are sent as VMC, each `ADDRESS:PORT[,room=NAME]`.
     pub vmc_out: Vec<VmcOutSpec>,
+    /// Folder of performers' profiles, read when the service starts and written when a fit ends.
+    pub profiles: Option<PathBuf>,
     /// How much of everything.
     pub limits: Limits,
     /// How long for everything.
@@ -84,6 +86,7 @@ impl Default for ServerConfig {
             character: None,
             listen_udp: Vec::new(),
             vmc_out: Vec::new(),
+            profiles: None,
             limits: Limits::default(),
             timeouts: Timeouts::default(),
             access: Access::default(),

@@ -5,7 +5,7 @@ use crate::recording::RecordedFeed;
 use crate::trackers::livelink_csv::LiveLinkCsv;
 use crate::trackers::openseeface_csv::{self, OpenSeeFaceCsv};
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
-use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, Settings, TrackingFrame};
+use rhytid_shared::{Character, Command, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -34,16 +34,12 @@ pub enum FeedError {
 }
 
 /// What stands on a line after the hello.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum FeedItem {
     /// A frame, written into the buffer given.
     Frame,
-    /// Take the neutral face now.
-    Calibrate,
-    /// Take over some settings from the next frame on.
-    Settings(Settings),
-    /// The head's present pose is straight ahead.
-    Recentre,
+    /// What the publisher asked for between two frames.
+    Command(Command),
 }
 
 /// The lines of a feed file, whatever it is on the disk.
@@ -107,9 +103,7 @@ impl<R: BufRead> Feed<R> {
         }
         match self.read(frame)? {
             PublishMessage::Frame => Ok(Some(FeedItem::Frame)),
-            PublishMessage::Calibrate => Ok(Some(FeedItem::Calibrate)),
-            PublishMessage::Settings(change) => Ok(Some(FeedItem::Settings(change))),
-            PublishMessage::Recentre => Ok(Some(FeedItem::Recentre)),
+            PublishMessage::Command(command) => Ok(Some(FeedItem::Command(command))),
             PublishMessage::Hello(_) => Err(self.refuse(MessageError::new("repeated_hello", "a feed has one hello, its first line"))),
         }
     }

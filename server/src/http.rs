@@ -4,7 +4,7 @@ use crate::config::Access;
 use crate::recording::{PlayError, PlayRequest, RecordError, RecorderStatus};
 use crate::service::{self, Hub, Peer};
 use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
-use crate::{page, publish, viewer};
+use crate::{control, page, publish, viewer};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{Path, Request, State};
@@ -12,7 +12,7 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
-use rhytid_shared::RoomName;
+use rhytid_shared::{RoomName, Slot};
 use std::net::IpAddr;
 use std::sync::Arc;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
@@ -28,8 +28,10 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
         .route("/api/recordings", get(recordings))
         .route("/api/rooms/{room}/replay", get(replay_status).post(replay).delete(end_replay))
         .route("/api/trackers", get(trackers))
+        .route("/api/profiles", get(profiles))
         .route("/characters/{file}", get(character))
         .route("/v1/rooms/{room}/publish", get(publish_socket))
+        .route("/v1/rooms/{room}/control", get(control_socket))
         .route("/v1/rooms/{room}/view", get(view_socket))
         .fallback(other)
         .layer(from_fn_with_state(hub.clone(), check_browser))
@@ -248,6 +250,10 @@ async fn trackers(State(hub): State<Arc<Hub>>) -> Response {
     axum::Json(serde_json::json!({ "ports": hub.trackers.list() })).into_response()
 }
 
+async fn profiles(State(hub): State<Arc<Hub>>) -> Response {
+    axum::Json(serde_json::json!({ "profiles": hub.profiles.list() })).into_response()
+}
+
 async fn character(State(hub): State<Arc<Hub>>, Path(file): Path<String>, headers: HeaderMap) -> Response {
     if hub.character_url.strip_prefix("/characters/") != Some(file.as_str()) {
         let message = format!("this server's character is at {}", hub.character_url);
@@ -280,13 +286,33 @@ async fn publish_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, r
     upgrade(&hub.clone(), request, handshake, config, Vec::new(), move |socket| publish::talk(hub, socket, room))
 }
 
+async fn control_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
+    let room = match room_name(&room) {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    let slot = query_field(&request, "slot").unwrap_or(Slot::MAIN).to_owned();
+    let handshake = match Handshake::check(&request) {
+        Ok(handshake) => handshake,
+        Err(answer) => return *answer,
+    };
+    let config = publish::socket_config(&hub);
+    let target = control::Target { hub: hub.clone(), room, slot };
+    upgrade(&hub, request, handshake, config, Vec::new(), move |socket| control::talk(target, socket))
+}
+
+/// A field of the request's query.
+fn query_field<'a>(request: &'a Request, name: &str) -> Option<&'a str> {
+    let query = request.uri().query().unwrap_or_default();
+    query.split('&').find_map(|pair| pair.split_once('=').filter(|(key, _)| *key == name)).map(|(_, value)| value)
+}
+
 async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
     let room = match room_name(&room) {
         Ok(room) => room,
         Err(error) => return error.response(StatusCode::BAD_REQUEST),
     };
-    let query = request.uri().query().unwrap_or_default();
-    let format = query.split('&').find_map(|pair| pair.strip_prefix("format=")).unwrap_or("binary");
+    let format = query_field(&request, "format").unwrap_or("binary");
     if !matches!(format, "json" | "binary") {
         let message = format!("query field format is {:?}, expected json or binary", format.chars().take(40).collect::<String>());
         return ErrorMessage::new("unknown_format", message).response(StatusCode::BAD_REQUEST);

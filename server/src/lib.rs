@@ -6,13 +6,17 @@
 
 #![forbid(unsafe_code)]
 
+mod answer;
 mod clip;
 mod config;
+mod control;
 pub mod feed;
+mod fit;
 mod http;
 mod metrics;
 mod page;
 pub mod pipeline;
+mod profiles;
 mod publish;
 pub mod recording;
 mod room;
@@ -28,6 +32,8 @@ mod viewer;
 
 pub use clip::{Clip, ClipError, ClipReader};
 pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts, Tls};
+pub use fit::{FitCliError, Guide, LiveFit, StepAt, fit_feed, fit_live, write_profile};
+pub use profiles::ProfileError;
 pub use send::{SendError, SendOptions, SendReport, SendSource, send};
 pub use service::{Play, ServerError, bind, load_character, run};
 pub use tls::{Identity, TlsError};

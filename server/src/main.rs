@@ -1,4 +1,4 @@
-//! The server's command line: `serve`, `send`, `fake`, and what works on recordings.
+//! The server's command line: `serve`, `send`, `fit`, `fake`, and what works on recordings.
 
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
@@ -7,12 +7,12 @@ use rhytid_server::recording::{
     Faces, PlayRequest, RecordConfig, Recording, RecoverReport, VerifyReport, export_csv, export_gltf, recover, verify, watch,
 };
 use rhytid_server::{
-    Access, Clip, FakeKind, FakeOptions, Identity, Limits, ListenSpec, Play, SendOptions, SendReport, SendSource, ServerConfig, Timeouts,
-    Tls, VmcOutSpec, bind, fake, load_character, run, send,
+    Access, Clip, FakeKind, FakeOptions, Guide, Identity, Limits, ListenSpec, LiveFit, Play, SendOptions, SendReport, SendSource,
+    ServerConfig, StepAt, Timeouts, Tls, VmcOutSpec, bind, fake, fit_feed, fit_live, load_character, run, send, write_profile,
 };
 use rhytid_shared::trust::Trust;
-use rhytid_shared::{Character, RoomName};
-use std::io::Write;
+use rhytid_shared::{Character, FIT_SECONDS, FitStep, Profile, ProfileChoice, RoomName, Settings};
+use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -50,6 +50,8 @@ enum Command {
     Recover(RecoverArgs),
     /// Write a recording as Live Link Face CSV, or as animations on the character (glTF).
     Export(ExportArgs),
+    /// Fit a performer: measure eight faces, from a recorded feed or live with instructions here, and write a profile.
+    Fit(FitArgs),
     /// Play another program's tracker from a feed file, to try its protocol without it.
     Fake(FakeArgs),
 }
@@ -182,6 +184,10 @@ struct ServeArgs {
     /// A program that gets a room's face as VMC (repeat for several).
     #[arg(long, value_name = "IP:PORT[,room=NAME]")]
     vmc_out: Vec<VmcOutSpec>,
+    /// Keep performers' profiles in this folder: a fit that is given a name is written there, and a tracker gets the newest one
+    /// that was made with it.
+    #[arg(long, value_name = "DIR")]
+    profiles: Option<PathBuf>,
     #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
@@ -223,6 +229,9 @@ struct SendArgs {
     /// Send frames of landmarks in the binary form, a twelfth of the bytes.
     #[arg(long)]
     binary: bool,
+    /// What is known of the performer: a profile's file, or the name of one that the server keeps.
+    #[arg(long, value_name = "FILE.json|NAME", value_parser = parse_profile)]
+    profile: Option<ProfileChoice>,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     #[arg(long, default_value = "15", value_name = "SECONDS", value_parser = parse_seconds)]
     timeout: Duration,
@@ -234,6 +243,61 @@ struct SendArgs {
 
 fn parse_trust(text: &str) -> Result<Trust, String> {
     if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
+}
+
+fn parse_profile(text: &str) -> Result<ProfileChoice, String> {
+    if let Ok(name) = RoomName::new(text) {
+        return Ok(ProfileChoice::Named(name));
+    }
+    let json = std::fs::read_to_string(text).map_err(|error| format!("cannot read it: {error}"))?;
+    Profile::from_json(&json).map(|profile| ProfileChoice::Given(Box::new(profile))).map_err(|error| error.message)
+}
+
+#[derive(Args)]
+struct FitArgs {
+    /// A recording of the eight faces; without one a live source is guided.
+    #[arg(value_name = "FEED")]
+    feed: Option<PathBuf>,
+    /// Where to write the profile.
+    #[arg(long, value_name = "FILE.json")]
+    out: PathBuf,
+    /// When the recording shows a face, seconds of the feed (repeat for each); without any, when the feed itself asks for it.
+    #[arg(long = "step", value_name = "STEP=FROM..TO", requires = "feed")]
+    steps: Vec<StepAt>,
+    /// What the profile is called; a server with --profiles keeps it by this name.
+    #[arg(long, value_parser = parse_name)]
+    name: Option<RoomName>,
+    /// The server of a live source.
+    #[arg(long, default_value = "ws://127.0.0.1:7878", value_name = "URL", conflicts_with = "feed")]
+    to: String,
+    /// Its room.
+    #[arg(long, default_value = "demo", value_parser = parse_name, conflicts_with = "feed")]
+    room: RoomName,
+    /// Its slot in the room.
+    #[arg(long, default_value = "main", value_parser = parse_name, conflicts_with = "feed")]
+    slot: RoomName,
+    /// How long to get into a face.
+    #[arg(long, default_value = "1.5", value_name = "SECONDS", value_parser = parse_seconds, conflicts_with = "feed")]
+    ready: Duration,
+    /// How long each face is measured, 0.2 to 10.
+    #[arg(long, default_value = "1.5", value_name = "SECONDS", value_parser = parse_hold, conflicts_with = "feed")]
+    hold: Duration,
+    /// Put sides right without asking.
+    #[arg(long)]
+    yes: bool,
+    /// Whom to trust on wss://, as of `send`.
+    #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
+    trust: Trust,
+}
+
+fn parse_name(text: &str) -> Result<RoomName, String> {
+    RoomName::new(text).map_err(|error| error.to_string())
+}
+
+fn parse_hold(text: &str) -> Result<Duration, String> {
+    let [least, most] = FIT_SECONDS;
+    let seconds = text.parse().ok().filter(|seconds| (least..=most).contains(seconds));
+    seconds.map(Duration::from_secs_f64).ok_or_else(|| format!("expected seconds from {least} to {most}"))
 }
 
 #[derive(Args)]
@@ -294,6 +358,7 @@ async fn main() -> ExitCode {
         Command::Replay(args) => replay_file(args).await,
         Command::Recover(args) => recover_file(&args),
         Command::Export(args) => export_file(&args),
+        Command::Fit(args) => fit(args).await,
         Command::Fake(args) => fake_feed(args).await,
     };
     match result {
@@ -352,6 +417,7 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "max-recording": record.file_bytes,
     }
     config.character = args.character.or(config.character);
+    config.profiles = args.profiles.or(config.profiles);
     config.listen_udp.extend(args.listen_udp);
     config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);
@@ -460,7 +526,19 @@ async fn replay_file(args: ReplayArgs) -> anyhow::Result<()> {
         let (to, room, takeover) = (args.server, room.to_string(), args.takeover);
         let (timeout, trust) = (Duration::from_secs(15), args.trust);
         let (speed, repeats) = (args.speed, args.repeats);
-        return send_with_progress(SendOptions { source, to, room, speed, repeats, takeover, binary: false, timeout, trust }).await;
+        return send_with_progress(SendOptions {
+            source,
+            to,
+            room,
+            speed,
+            repeats,
+            takeover,
+            binary: false,
+            profile: None,
+            timeout,
+            trust,
+        })
+        .await;
     }
     let request = PlayRequest {
         speed: Some(args.speed),
@@ -557,6 +635,7 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         repeats: args.repeats,
         takeover: args.takeover,
         binary: args.binary,
+        profile: args.profile,
         timeout: args.timeout,
         trust: args.trust,
     };
@@ -574,6 +653,59 @@ async fn send_with_progress(options: SendOptions) -> anyhow::Result<()> {
     ensure!(errors == 0, "sent {frames} frames, of all messages the server refused {errors}");
     eprintln!("sent {frames} frames, none refused");
     Ok(())
+}
+
+async fn fit(args: FitArgs) -> anyhow::Result<()> {
+    let FitArgs { feed, out, steps, name, to, room, slot, ready, hold, yes, trust } = args;
+    let profile = if let Some(feed) = feed {
+        let (character, _) = load_character(None)?;
+        let report = fit_feed(&feed, &character, steps, name.as_ref(), |line| eprintln!("{line}"))?;
+        report.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
+        let mut profile = report.profile;
+        if yes {
+            profile.settings.change(&report.offers);
+        } else if report.offers != Settings::default() {
+            eprintln!("--yes puts it right in the profile");
+        }
+        profile
+    } else {
+        let options =
+            LiveFit { to, room: room.to_string(), slot: slot.to_string(), name: name.map(|name| name.to_string()), ready, hold, trust };
+        fit_live(&options, &mut Terminal { yes }).await?
+    };
+    write_profile(&profile, &out).with_context(|| format!("cannot write {}", out.display()))?;
+    eprintln!("wrote {}", out.display());
+    Ok(())
+}
+
+/// Guides a performer by lines of text.
+struct Terminal {
+    yes: bool,
+}
+
+impl Guide for Terminal {
+    fn ask(&mut self, step: FitStep, at: usize, of: usize, ready: Duration, hold: Duration) {
+        let bell = if std::io::stderr().is_terminal() { "\x07" } else { "" };
+        eprintln!("{bell}[{at}/{of}] {}: in {:.1} s, for {:.1} s", step.instruction(), ready.as_secs_f64(), hold.as_secs_f64());
+    }
+
+    fn tell(&mut self, text: &str) {
+        eprintln!("      {text}");
+    }
+
+    fn agrees(&mut self, offers: &Settings) -> bool {
+        if self.yes {
+            return true;
+        }
+        let offered = serde_json::to_string(offers).unwrap_or_default();
+        if !std::io::stdin().is_terminal() {
+            eprintln!("      --yes puts it right: {offered}");
+            return false;
+        }
+        eprint!("      put it right ({offered})? [Y/n] ");
+        let mut line = String::new();
+        std::io::stdin().read_line(&mut line).is_ok() && !line.trim().to_lowercase().starts_with('n')
+    }
 }
 
 async fn fake_feed(args: FakeArgs) -> anyhow::Result<()> {

@@ -3,7 +3,7 @@
 
 use crate::solve::{Calibration, CalibrationReport, DelayReport, SolveConfig, SolveError, Solver};
 use rhytid_shared::packet::{Encoder, PacketKind};
-use rhytid_shared::{Character, FaceFrame, PublishHello, Settings, TrackingFrame};
+use rhytid_shared::{Character, Command, FaceFrame, PublishHello, TrackingFrame};
 use std::sync::Arc;
 
 /// Solves and encodes the frames of one session.
@@ -67,19 +67,14 @@ impl Pipeline {
         self.solver.calibrate();
     }
 
-    /// Takes over some settings, which have been checked, from the next frame on.
-    pub fn set(&mut self, change: &Settings) -> Result<(), SolveError> {
-        self.solver.set(change)
+    /// Does what a feed's command says.
+    pub fn command(&mut self, command: &Command) -> Result<(), SolveError> {
+        self.solver.command(command)
     }
 
-    /// The settings in use.
-    pub fn settings(&self) -> &Settings {
-        self.solver.settings()
-    }
-
-    /// Makes the head's present pose straight ahead; false where no face has been seen yet.
-    pub fn recentre(&mut self) -> bool {
-        self.solver.recentre()
+    /// The solve itself: settings, profile, fit.
+    pub(crate) fn solver(&mut self) -> &mut Solver {
+        &mut self.solver
     }
 
     /// A neutral that has been reached since the last call.

@@ -1,15 +1,14 @@
 //! One publisher: its messages are read, solved, encoded and put into its room, in the order they come.
 
+use crate::answer::Answer;
 use crate::config::seconds;
 use crate::room::RoomError;
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
-use crate::solve::DelayReport;
 use crate::source::{FrameError, OpenError, Sent, Source};
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
-use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, Settings, TrackingFrame};
-use serde::Serialize;
+use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -17,43 +16,6 @@ use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::{Bytes, Message, Utf8Bytes};
-
-/// Answers to a publisher, besides errors.
-#[derive(Debug, Serialize)]
-#[serde(tag = "type", rename_all = "snake_case")]
-enum Answer<'a> {
-    /// The hello was taken; frames may come.
-    Ready {
-        version: u32,
-        room: &'a str,
-        /// Number of this session in its room.
-        session: u32,
-        /// True where the session starts from the neutral face that the room has kept.
-        kept_neutral: bool,
-        character: &'a str,
-        /// Names that `bones` frames may use.
-        bones: Vec<&'a str>,
-    },
-    /// The settings in use.
-    Settings {
-        #[serde(flatten)]
-        settings: &'a Settings,
-        added_delay: DelayReport,
-    },
-    /// The head's present pose is straight ahead.
-    Recentred,
-    /// A neutral face has been taken.
-    Calibrated {
-        /// Sender's time at which it was reached, seconds.
-        t: f64,
-        /// Frames it is the median of.
-        frames: usize,
-        /// True where the publisher asked for it.
-        requested: bool,
-        /// Delay the smoothing adds at present, seconds by group.
-        added_delay: DelayReport,
-    },
-}
 
 /// Buffers for messages of the configured size.
 pub(crate) fn socket_config(hub: &Hub) -> WebSocketConfig {
@@ -65,12 +27,6 @@ pub(crate) fn socket_config(hub: &Hub) -> WebSocketConfig {
         .max_message_size(Some(most))
         .max_frame_size(Some(most))
 }
-
-/// Calibrations a second from one publisher: each may solve all its frames of the last seconds anew.
-const CALIBRATIONS_PER_SECOND: u32 = 2;
-
-/// Changes of settings a second from one publisher: a knob that is turned on a page.
-const SETTINGS_PER_SECOND: u32 = 30;
 
 /// Takes a publisher's messages until one side ends it.
 pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName) {
@@ -127,8 +83,6 @@ struct Session<'a> {
     reader: PublishReader,
     frame: TrackingFrame,
     messages: Rate,
-    calibrations: Rate,
-    settings: Rate,
     /// The sender knows that it is too fast.
     has_told_rate: bool,
     num_bad_in_a_row: u32,
@@ -136,15 +90,12 @@ struct Session<'a> {
 
 impl<'a> Session<'a> {
     fn new(hub: &'a Hub, source: Source, reader: PublishReader) -> Self {
-        let now = Instant::now();
         Self {
             hub,
             source,
             reader,
             frame: TrackingFrame::default(),
-            messages: Rate::new(hub.config.limits.frames_per_second, now),
-            calibrations: Rate::new(CALIBRATIONS_PER_SECOND, now),
-            settings: Rate::new(SETTINGS_PER_SECOND, now),
+            messages: Rate::new(hub.config.limits.frames_per_second, Instant::now()),
             has_told_rate: false,
             num_bad_in_a_row: 0,
         }
@@ -160,14 +111,19 @@ impl<'a> Session<'a> {
             kept_neutral: self.source.kept_neutral,
             character: &character.name,
             bones: character.bones.iter().map(|bone| bone.name.as_str()).collect(),
+            profile: self.source.profile_name(),
         };
         let timeouts = &self.hub.config.timeouts;
         let (ping, write) = (seconds(timeouts.ping), seconds(timeouts.write));
-        send_json(socket, &ready, write).await?;
+        send(socket, Message::Text(ready.text()), write).await?;
         let mut last_ping = Instant::now();
         loop {
             let message = tokio::select! {
                 message = socket.next() => message,
+                control = self.source.next_control() => {
+                    self.source.control(control);
+                    continue;
+                }
                 () = tokio::time::sleep_until(last_ping + ping) => {
                     last_ping = Instant::now();
                     send(socket, Message::Ping(Bytes::new()), write).await?;
@@ -197,36 +153,15 @@ impl<'a> Session<'a> {
     /// Takes one message as it was read.
     async fn take(&mut self, socket: &mut Socket, message: Result<PublishMessage, MessageError>, sent: Sent) -> Result<(), Stop> {
         match message {
-            Ok(PublishMessage::Calibrate) => {
-                if self.calibrations.take_if_free(Instant::now()) {
-                    self.source.calibrate();
+            Ok(PublishMessage::Command(command)) => match self.source.command(command) {
+                Ok(answer) => {
                     self.source.record_taken(sent);
-                } else {
-                    let message = format!("more than {CALIBRATIONS_PER_SECOND} calibrations a second: this one is left out");
-                    return self.refuse(socket, sent, ErrorMessage::new("too_many_calibrations", message)).await;
+                    if let Some(answer) = answer {
+                        send(socket, Message::Text(answer), seconds(self.hub.config.timeouts.write)).await?;
+                    }
                 }
-            }
-            // Other sides begin another search, so these are held to the rate of calibrations, too.
-            Ok(PublishMessage::Settings(_) | PublishMessage::Recentre) if !self.settings.take_if_free(Instant::now()) => {
-                let message = format!("more than {SETTINGS_PER_SECOND} changes of settings a second: this one is left out");
-                return self.refuse(socket, sent, ErrorMessage::new("too_many_settings", message)).await;
-            }
-            Ok(PublishMessage::Settings(change)) => {
-                if let Err(error) = self.source.set(&change) {
-                    return self.refuse(socket, sent, ErrorMessage::new("bad_settings", error.to_string())).await;
-                }
-                self.source.record_taken(sent);
-                let answer = Answer::Settings { settings: self.source.settings(), added_delay: self.source.added_delay() };
-                send_json(socket, &answer, seconds(self.hub.config.timeouts.write)).await?;
-            }
-            Ok(PublishMessage::Recentre) => {
-                if !self.source.recentre() {
-                    let message = "no face has been seen yet, expected one to re-centre";
-                    return self.refuse(socket, sent, ErrorMessage::new("no_face", message)).await;
-                }
-                self.source.record_taken(sent);
-                send_json(socket, &Answer::Recentred, seconds(self.hub.config.timeouts.write)).await?;
-            }
+                Err(error) => return self.refuse(socket, sent, error).await,
+            },
             Ok(PublishMessage::Hello(_)) => unreachable!("the reader refuses a second hello"),
             Ok(PublishMessage::Frame) => match self.source.frame(self.hub, &self.frame, Some(sent.clone())) {
                 Ok(()) => self.num_bad_in_a_row = 0,
@@ -238,14 +173,12 @@ impl<'a> Session<'a> {
             },
             Err(error) => return self.refuse(socket, sent, ErrorMessage::new(error.code, error.message)).await,
         }
-        if let Some(report) = self.source.take_calibrated() {
-            let answer = Answer::Calibrated {
-                t: report.t,
-                frames: report.num_frames,
-                requested: report.requested,
-                added_delay: self.source.added_delay(),
-            };
-            send_json(socket, &answer, seconds(self.hub.config.timeouts.write)).await?;
+        for told in self.source.news() {
+            match told {
+                Ok(text) => send(socket, Message::Text(text), seconds(self.hub.config.timeouts.write)).await?,
+                // The step is to be made again; no message was bad.
+                Err(error) => send_json(socket, &error, seconds(self.hub.config.timeouts.write)).await?,
+            }
         }
         Ok(())
     }
@@ -301,6 +234,7 @@ async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<Utf8Bytes, Stop> {
 fn not_opened(error: OpenError) -> Stop {
     match error {
         OpenError::Hello(_) => refusal("bad_hello", error.to_string()),
+        OpenError::Profile(_) => refusal("unknown_profile", error.to_string()),
         OpenError::Room(refused) => {
             let code = match refused {
                 RoomError::Taken | RoomError::SlotTaken => CloseCode::Policy,

@@ -4,6 +4,7 @@ use crate::metrics::Metrics;
 use crate::recording::{Item, RecordError, Recorder, RecorderStatus, SessionEvent, Sink};
 use crate::solve::Calibration;
 use crate::solve::mix::Mixer;
+use crate::source::Control;
 use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
 use rhytid_shared::{ChannelGroup, Character, FaceFrame, PublishHello, RoomName, Slot};
@@ -11,7 +12,7 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
-use tokio::sync::{oneshot, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_tungstenite::tungstenite::{Bytes, Utf8Bytes};
 
 /// The newest state of a room, shared by all its viewers.
@@ -153,6 +154,7 @@ struct Publisher {
     /// Frames that the room has taken.
     num_frames: u64,
     evict: oneshot::Sender<()>,
+    controls: mpsc::Sender<Control>,
 }
 
 /// A room as `/api/rooms` lists it.
@@ -234,11 +236,13 @@ impl Rooms {
     }
 
     /// Enters a room as a source, in place of the one in its slot where the claim says so. What comes with the place says when
-    /// another takes it. `recorded` makes of the session's number what a recording shall say of its beginning.
+    /// another takes it; others reach it through `controls`. `recorded` makes of the session's number what a recording shall say of
+    /// its beginning.
     pub fn claim(
         &self,
         name: &RoomName,
         claim: SlotClaim,
+        controls: mpsc::Sender<Control>,
         recorded: impl FnOnce(u32) -> Vec<Item>,
     ) -> Result<(Publishing, Evicted), RoomError> {
         let mut by_name = lock(&self.by_name);
@@ -267,7 +271,7 @@ impl Rooms {
             recorded(session).into_iter().for_each(|item| room.record(&state, || item));
         }
         state.mixer.enter(session, &claim.slot);
-        state.publishers.push(Publisher { session, claim, since: Instant::now(), num_frames: 0, evict });
+        state.publishers.push(Publisher { session, claim, since: Instant::now(), num_frames: 0, evict, controls });
         drop(state);
         if let Some(before) = before {
             // Its task may have ended in this moment; then nobody needs to be told.
@@ -292,11 +296,6 @@ impl Rooms {
     /// The room, made where there is none.
     pub fn room(&self, name: &RoomName) -> Result<Arc<Room>, RoomError> {
         self.find_or_make(&mut lock(&self.by_name), name)
-    }
-
-    /// The room, where there is one.
-    pub fn find(&self, name: &RoomName) -> Option<Arc<Room>> {
-        lock(&self.by_name).get(name).cloned()
     }
 
     fn find_or_make(&self, by_name: &mut BTreeMap<RoomName, Arc<Room>>, name: &RoomName) -> Result<Arc<Room>, RoomError> {
@@ -334,9 +333,14 @@ impl Rooms {
         Ok(room)
     }
 
+    /// The room of this name.
+    pub fn find(&self, name: &RoomName) -> Option<Arc<Room>> {
+        lock(&self.by_name).get(name).cloned()
+    }
+
     /// The neutral face that the room keeps, for the slot of `hello`, of its tracker.
     pub fn neutral(&self, name: &RoomName, hello: &PublishHello) -> Option<Calibration> {
-        let room = lock(&self.by_name).get(name).cloned()?;
+        let room = self.find(name)?;
         let state = lock(&room.state);
         state.neutrals.get(&hello.slot.name).filter(|kept| kept.hello.is_of_same_tracker(hello)).map(|kept| kept.calibration.clone())
     }
@@ -414,6 +418,7 @@ impl Room {
                 source: claim.source.clone(),
                 under_way: true,
                 kept_neutral: None,
+                profile: None,
                 solve: None,
             };
             sink.put(self.nanos(), Item::Event(event));
@@ -439,6 +444,12 @@ impl Room {
         let sink = lock(&self.state).recording.take()?;
         sink.put(self.nanos(), Item::Event(SessionEvent::Stop { reason: "asked to".into() }));
         Some(sink.status())
+    }
+
+    /// Where commands to the source in this slot go.
+    pub fn controls(&self, slot: &str) -> Option<mpsc::Sender<Control>> {
+        let state = lock(&self.state);
+        state.publishers.iter().find(|publisher| publisher.claim.slot.name == slot).map(|publisher| publisher.controls.clone())
     }
 
     fn listing(&self) -> RoomListing {
@@ -599,14 +610,13 @@ mod tests {
     fn rooms(max_rooms: usize, max_viewers: usize) -> Rooms {
         let character = Arc::new(Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap());
         let metrics = Arc::new(Metrics::new());
-        let recorder =
-            Recorder::new(crate::recording::RecordConfig::default(), &character, metrics.clone(), tokio::sync::mpsc::channel(1).0);
+        let recorder = Recorder::new(crate::recording::RecordConfig::default(), &character, metrics.clone(), mpsc::channel(1).0);
         Rooms::new(character, max_rooms, max_viewers, metrics, Arc::new(recorder))
     }
 
-    /// Nothing is recorded here.
-    fn nothing(_: u32) -> Vec<Item> {
-        Vec::new()
+    /// Claims a slot that nobody commands, and of which nothing is recorded.
+    fn claim(rooms: &Rooms, name: &RoomName, claim: SlotClaim) -> Result<(Publishing, Evicted), RoomError> {
+        rooms.claim(name, claim, mpsc::channel(1).0, |_| Vec::new())
     }
 
     fn main(source: &str, takeover: bool) -> SlotClaim {
@@ -621,10 +631,10 @@ mod tests {
     fn slots_are_taken_one_by_one() {
         let rooms = rooms(10, 10);
         let room = name("a");
-        let mut places: Vec<_> = (0..MAX_SLOTS).map(|i| rooms.claim(&room, slot(&format!("s{i}"), false), nothing).unwrap()).collect();
-        assert_eq!(rooms.claim(&room, slot("more", false), nothing).err(), Some(RoomError::TooManySlots { most: 8 }));
-        assert_eq!(rooms.claim(&room, slot("s3", false), nothing).err(), Some(RoomError::SlotTaken));
-        let again = rooms.claim(&room, slot("s3", true), nothing).unwrap();
+        let mut places: Vec<_> = (0..MAX_SLOTS).map(|i| claim(&rooms, &room, slot(&format!("s{i}"), false)).unwrap()).collect();
+        assert_eq!(claim(&rooms, &room, slot("more", false)).err(), Some(RoomError::TooManySlots { most: 8 }));
+        assert_eq!(claim(&rooms, &room, slot("s3", false)).err(), Some(RoomError::SlotTaken));
+        let again = claim(&rooms, &room, slot("s3", true)).unwrap();
         assert_eq!(places[3].1.try_recv(), Ok(()), "it is told");
         assert!(places[2].1.try_recv().is_err(), "and nobody else");
         assert_eq!(rooms.metrics.publishers.get(), 8);
@@ -643,15 +653,15 @@ mod tests {
     #[test]
     fn a_room_has_one_publisher_and_takeover_replaces_it() {
         let rooms = rooms(10, 10);
-        let (first, mut evicted) = rooms.claim(&name("a"), main("one", false), nothing).unwrap();
-        assert_eq!(rooms.claim(&name("a"), main("two", false), nothing).err(), Some(RoomError::Taken));
-        let (second, _evicted) = rooms.claim(&name("a"), main("two", true), nothing).unwrap();
+        let (first, mut evicted) = claim(&rooms, &name("a"), main("one", false)).unwrap();
+        assert_eq!(claim(&rooms, &name("a"), main("two", false)).err(), Some(RoomError::Taken));
+        let (second, _evicted) = claim(&rooms, &name("a"), main("two", true)).unwrap();
         assert_eq!((first.session, second.session), (1, 2));
         assert_eq!(evicted.try_recv(), Ok(()));
         drop(first);
-        assert_eq!(rooms.claim(&name("a"), main("three", false), nothing).err(), Some(RoomError::Taken), "the old one's end frees nothing");
+        assert_eq!(claim(&rooms, &name("a"), main("three", false)).err(), Some(RoomError::Taken), "the old one's end frees nothing");
         drop(second);
-        assert_eq!(rooms.claim(&name("a"), main("three", false), nothing).unwrap().0.session, 3);
+        assert_eq!(claim(&rooms, &name("a"), main("three", false)).unwrap().0.session, 3);
         assert_eq!(rooms.metrics.publishers.get(), 0);
     }
 
@@ -662,7 +672,7 @@ mod tests {
         let rooms = rooms(1, 1);
         let text = include_str!("../../shared/assets/demo.ibug68.jsonl");
         let mut feed = crate::feed::Feed::new(std::io::Cursor::new(text), "demo".into(), &rooms.character).unwrap();
-        let (place, _evicted) = rooms.claim(&name("a"), SlotClaim::of(&feed.hello), nothing).unwrap();
+        let (place, _evicted) = claim(&rooms, &name("a"), SlotClaim::of(&feed.hello)).unwrap();
         let mut pipeline = Pipeline::new(rooms.character.clone(), &SolveConfig::default(), &feed.hello, place.session).unwrap();
         let (mut frame, mut packet) = (rhytid_shared::TrackingFrame::default(), Vec::new());
         for _ in 0..120 {
@@ -679,7 +689,7 @@ mod tests {
         let rooms = rooms(2, 1);
         let viewer = rooms.join(&name("a")).unwrap();
         assert_eq!(rooms.join(&name("a")).err(), Some(RoomError::TooManyViewers { most: 1 }));
-        let publisher = rooms.claim(&name("b"), main("", false), nothing).unwrap();
+        let publisher = claim(&rooms, &name("b"), main("", false)).unwrap();
         assert_eq!(rooms.join(&name("c")).err(), Some(RoomError::TooManyRooms { most: 2 }));
         rooms.sweep(Duration::ZERO);
         assert_eq!((rooms.list().len(), rooms.metrics.rooms.get(), rooms.metrics.viewers.get()), (2, 2, 1));

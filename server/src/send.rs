@@ -8,7 +8,7 @@ use futures_util::{SinkExt, StreamExt};
 use indicatif::ProgressBar;
 use rhytid_shared::trust::Trust;
 use rhytid_shared::view::SUBPROTOCOL;
-use rhytid_shared::{TrackingData, TrackingFrame, encode_landmarks};
+use rhytid_shared::{ProfileChoice, TrackingData, TrackingFrame, encode_landmarks};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -87,6 +87,8 @@ pub struct SendOptions {
     pub takeover: bool,
     /// Send frames of landmarks in the binary form, a twelfth of the bytes; what it has no room for stays JSON.
     pub binary: bool,
+    /// What is known of the performer, in place of what the feed's hello says.
+    pub profile: Option<ProfileChoice>,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     pub timeout: Duration,
     /// Whom to trust where `to` is `wss://`.
@@ -226,7 +228,7 @@ enum Answer {
     Unknown,
 }
 
-type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
+pub(crate) type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 type Sink = SplitSink<Socket, Message>;
 type Answers = SplitStream<Socket>;
 
@@ -237,9 +239,10 @@ async fn send_once<R: BufRead>(
     report: &mut SendReport,
     mut stop: Pin<&mut impl Future<Output = ()>>,
 ) -> Result<Ending, SendError> {
+    let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
     let connected = tokio::select! {
         () = stop.as_mut() => return Ok(Ending::Stopped),
-        connected = connect(options) => connected?,
+        connected = connect(url, &options.trust, options.timeout) => connected?,
     };
     let (mut sink, answers) = connected.split();
     let (ready, is_ready) = oneshot::channel();
@@ -285,19 +288,18 @@ async fn send_once<R: BufRead>(
     }
 }
 
-/// Connects to the room's publish socket.
-async fn connect(options: &SendOptions) -> Result<Socket, SendError> {
-    let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
+/// Opens a WebSocket of the server's.
+pub(crate) async fn connect(url: String, trust: &Trust, timeout: Duration) -> Result<Socket, SendError> {
     let connecting = async {
         let mut request = url.as_str().into_client_request()?;
         request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
-        let config = options.trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
+        let config = trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
         connect_async_tls_with_config(request, None, false, Some(Connector::Rustls(config))).await
     };
-    let problem = match tokio::time::timeout(options.timeout, connecting).await {
+    let problem = match tokio::time::timeout(timeout, connecting).await {
         Ok(Ok((socket, _))) => return Ok(socket),
         Ok(Err(error)) => explain(error),
-        Err(_) => format!("no answer within {} s", options.timeout.as_secs_f64()),
+        Err(_) => format!("no answer within {} s", timeout.as_secs_f64()),
     };
     Err(SendError::Connect { url, problem })
 }
@@ -327,7 +329,7 @@ async fn publish<R: BufRead>(
         Ok(Err(_)) => Err(Unsent::Lost),
         Err(_) => Err(within("it read nothing")),
     };
-    write(Message::text(hello(feed.text(), options.takeover))).await?;
+    write(Message::text(hello(feed.text(), options))).await?;
     // An error means that the listening has ended, which is told there.
     if tokio::time::timeout(options.timeout, is_ready).await.map_err(|_| within("no answer to the hello"))?.is_err() {
         return Err(Unsent::Lost);
@@ -405,15 +407,25 @@ async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sen
     End { is_normal: false, reason: last_error.unwrap_or_else(|| "the connection broke off".into()), errors }
 }
 
-/// The feed's hello, with `takeover` where it is wanted.
-fn hello(line: &str, takeover: bool) -> String {
-    match serde_json::from_str::<serde_json::Map<String, serde_json::Value>>(line) {
-        Ok(mut fields) if takeover => {
-            fields.insert("takeover".into(), true.into());
-            serde_json::Value::from(fields).to_string()
-        }
-        _ => line.to_owned(),
+/// The feed's hello, with `takeover` and the profile where they are wanted.
+fn hello(line: &str, options: &SendOptions) -> String {
+    if !options.takeover && options.profile.is_none() {
+        return line.to_owned();
     }
+    let Ok(mut fields) = serde_json::from_str::<serde_json::Map<String, serde_json::Value>>(line) else { return line.to_owned() };
+    if options.takeover {
+        fields.insert("takeover".into(), true.into());
+    }
+    match &options.profile {
+        Some(ProfileChoice::Given(profile)) => {
+            fields.insert("profile".into(), serde_json::to_value(profile).expect("plain data can be written"));
+        }
+        Some(ProfileChoice::Named(name)) => {
+            fields.insert("profile".into(), name.as_str().into());
+        }
+        None => {}
+    }
+    serde_json::Value::from(fields).to_string()
 }
 
 /// A failed handshake in the server's own words, where it has some.

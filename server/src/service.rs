@@ -3,6 +3,7 @@
 use crate::config::{Limits, ServerConfig, ServerConfigError, seconds};
 use crate::http::router;
 use crate::metrics::Metrics;
+use crate::profiles::{ProfileError, Profiles};
 use crate::recording::{PlayError, PlayRequest, Players, RecordError, Recorder, RecorderStatus};
 use crate::room::{Room, Rooms};
 use crate::socket::{ErrorMessage, say_and_close};
@@ -65,6 +66,9 @@ pub enum ServerError {
     /// The recording could not be played.
     #[error(transparent)]
     Play(PlayError),
+    /// The folder of profiles cannot be used.
+    #[error(transparent)]
+    Profiles(#[from] ProfileError),
     /// There is no certificate.
     #[error(transparent)]
     Tls(#[from] TlsError),
@@ -106,6 +110,7 @@ pub(crate) struct Hub {
     pub recorder: Arc<Recorder>,
     pub players: Players,
     pub trackers: Trackers,
+    pub profiles: Arc<Profiles>,
     pub metrics: Arc<Metrics>,
     pub listens_on_loopback: bool,
     /// True once the service ends.
@@ -174,6 +179,7 @@ pub async fn run(
     for spec in &config.vmc_out {
         outs.push(VmcOut::bind(spec).await?);
     }
+    let profiles = Profiles::load(config.profiles.as_deref())?;
     let metrics = Arc::new(Metrics::new());
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
@@ -188,6 +194,7 @@ pub async fn run(
         hello_character,
         layout,
         trackers: Trackers::default(),
+        profiles: Arc::new(profiles),
         listens_on_loopback: address.ip().is_loopback(),
         character,
         glb: glb.into(),

@@ -1,12 +1,19 @@
-//! One source of a room, whatever it speaks, a WebSocket or a tracker's datagrams: frame in → solve → mix → room.
+//! One source of a room, whatever it speaks, a WebSocket or a tracker's datagrams: frame in → solve → mix → room; and what it,
+//! or somebody for it, asks for.
 
+use crate::answer::Answer;
 use crate::pipeline::Pipeline;
+use crate::profiles::Profiles;
+use crate::publish::Rate;
 use crate::recording::{Item, SessionEvent, text};
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
-use crate::solve::{Calibration, CalibrationReport, DelayReport, SolveError};
-use rhytid_shared::{PublishHello, PublishReader, RoomName, Settings, TrackingFrame};
+use crate::socket::ErrorMessage;
+use crate::solve::{Calibration, SolveError};
+use rhytid_shared::{Command, FitRequest, Profile, ProfileChoice, PublishHello, PublishReader, RoomName, Settings, TrackingFrame};
 use std::sync::Arc;
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::{Bytes, Utf8Bytes};
 
 /// A message as its publisher sent it.
@@ -25,16 +32,29 @@ impl Sent {
     }
 }
 
+/// Calibrations a second of one source: each may solve all its frames of the last seconds anew.
+const CALIBRATIONS_PER_SECOND: u32 = 2;
+/// Other commands a second of one source: a knob that is turned on a page.
+const COMMANDS_PER_SECOND: u32 = 30;
+
 /// Why a source could not enter a room.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum OpenError {
     /// The hello's layout, camera or settings make no sense.
     #[error("hello: {0}")]
     Hello(#[from] SolveError),
+    /// The profile is not here.
+    #[error("hello: {0}")]
+    Profile(#[from] UnknownProfile),
     /// The room or the slot has no place.
     #[error(transparent)]
     Room(#[from] RoomError),
 }
+
+/// The server keeps no profile of this name.
+#[derive(Debug, thiserror::Error)]
+#[error("field profile is \"{0}\", which this server does not keep: see /api/profiles")]
+pub(crate) struct UnknownProfile(RoomName);
 
 /// Why a frame was not taken.
 #[derive(Debug, thiserror::Error)]
@@ -47,11 +67,42 @@ pub(crate) enum FrameError {
     Evicted,
 }
 
+/// What a command, or what came of it later, is answered with: JSON.
+pub(crate) type Told = Result<Utf8Bytes, ErrorMessage>;
+
+/// A command from elsewhere than the source's own connection.
+pub(crate) struct Control {
+    pub command: Command,
+    /// As it was sent.
+    pub text: Utf8Bytes,
+    pub answer: oneshot::Sender<Told>,
+}
+
+/// Commands from elsewhere that may wait for one source.
+pub(crate) const MOST_CONTROLS: usize = 4;
+
+/// Who waits for a step of the fit.
+#[derive(Default)]
+enum FitOwner {
+    #[default]
+    Publisher,
+    Control(oneshot::Sender<Told>),
+}
+
 /// A source that has claimed its slot; gives it back on drop.
 pub(crate) struct Source {
     place: Publishing,
     pipeline: Pipeline,
     hello: PublishHello,
+    controls: mpsc::Receiver<Control>,
+    profiles: Arc<Profiles>,
+    /// The profile in use.
+    profile: Option<Profile>,
+    /// Its settings have changed since it was kept.
+    is_profile_changed: bool,
+    fit_owner: FitOwner,
+    calibrations: Rate,
+    commands: Rate,
     num_frames: u64,
     /// Its slot's name.
     slot: Arc<str>,
@@ -64,10 +115,20 @@ pub(crate) struct Source {
 impl Source {
     /// Claims the slot that `hello` names; `sent` is the hello's text where the publisher sent one. The second value is done when another
     /// publisher has taken it over.
-    pub fn open(hub: &Hub, room: &RoomName, hello: PublishHello, sent: Option<Utf8Bytes>) -> Result<(Self, Evicted), OpenError> {
+    pub fn open(hub: &Hub, room: &RoomName, mut hello: PublishHello, sent: Option<Utf8Bytes>) -> Result<(Self, Evicted), OpenError> {
+        let profile = match hello.profile.take() {
+            Some(ProfileChoice::Given(profile)) => Some(*profile),
+            Some(ProfileChoice::Named(name)) => match hub.profiles.named(&name) {
+                Some(profile) => Some((*profile).clone()),
+                None => return Err(UnknownProfile(name).into()),
+            },
+            None => hub.profiles.of_source(&hello.source).map(|profile| (*profile).clone()),
+        };
+        hello.profile = profile.clone().map(|profile| ProfileChoice::Given(Box::new(profile)));
         // Before the slot is claimed: a hello that leads to nothing takes no slot from anybody.
         let kept = hello.keep_neutral.then(|| hub.rooms.neutral(room, &hello)).flatten();
         let (mut pipeline, kept_neutral) = start(hub, &hello, kept.clone())?;
+        let (controls, waiting) = mpsc::channel(MOST_CONTROLS);
         let slot: Arc<str> = hello.slot.name.as_str().into();
         let reader = sent.is_none().then(|| {
             let mut reader = PublishReader::new(&hub.character);
@@ -82,16 +143,35 @@ impl Source {
                 source: hello.source.clone(),
                 under_way: false,
                 kept_neutral: kept.filter(|_| kept_neutral).map(Box::new),
+                profile: profile.clone().map(Box::new),
                 solve: Some(Box::new(hub.config.solve.clone())),
             };
             let text = sent.unwrap_or_else(|| text::of_hello(&hello).into());
             vec![Item::Event(start), Item::Text { slot: slot.clone(), t: None, text }]
         };
-        let (place, evicted) = hub.rooms.claim(room, SlotClaim::of(&hello), recorded)?;
+        let (place, evicted) = hub.rooms.claim(room, SlotClaim::of(&hello), controls, recorded)?;
         pipeline.set_session(place.session);
         let session = place.session;
-        tracing::info!(%room, session, source = hello.source, slot = %slot, takeover = hello.takeover, kept_neutral, "publisher ready");
-        Ok((Self { place, pipeline, hello, num_frames: 0, slot, reader: reader.flatten(), kept_neutral }, evicted))
+        let called = profile.as_ref().map(|profile| profile.name.as_str());
+        tracing::info!(%room, session, source = hello.source, slot = %slot, takeover = hello.takeover, kept_neutral, profile = called, "publisher ready");
+        let now = Instant::now();
+        let source = Self {
+            place,
+            pipeline,
+            hello,
+            controls: waiting,
+            profiles: hub.profiles.clone(),
+            profile,
+            is_profile_changed: false,
+            fit_owner: FitOwner::Publisher,
+            calibrations: Rate::new(CALIBRATIONS_PER_SECOND, now),
+            commands: Rate::new(COMMANDS_PER_SECOND, now),
+            num_frames: 0,
+            slot,
+            reader: reader.flatten(),
+            kept_neutral,
+        };
+        Ok((source, evicted))
     }
 
     /// Solves a frame and puts it into the room; `sent` is its message where the publisher sent one.
@@ -138,31 +218,181 @@ impl Source {
         self.place.record(|| Item::Refused { slot: self.slot.clone(), bytes });
     }
 
-    /// Takes the neutral face now.
-    pub fn calibrate(&mut self) {
-        self.pipeline.calibrate();
+    /// Does what is asked for. The answer to a step of the fit comes later, with [`Self::news`].
+    pub fn command(&mut self, command: Command) -> Result<Option<Utf8Bytes>, ErrorMessage> {
+        self.check_rate(&command)?;
+        let solver = self.pipeline.solver();
+        let answer = match command {
+            Command::Calibrate => {
+                solver.calibrate();
+                return Ok(None);
+            }
+            Command::Settings(change) => {
+                solver.set(&change).map_err(|error| ErrorMessage::new("bad_settings", error.to_string()))?;
+                self.settings_changed();
+                self.settings_answer()
+            }
+            Command::Recentre if solver.recentre() => Answer::Recentred.text(),
+            Command::Recentre => {
+                return Err(ErrorMessage::new("no_face", "no face has been seen yet, expected one to re-centre"));
+            }
+            Command::Fit(FitRequest::Measure { step, seconds }) => {
+                solver.measure(step, seconds);
+                self.own_fit(FitOwner::Publisher);
+                return Ok(None);
+            }
+            Command::Fit(FitRequest::Cancel) => {
+                solver.cancel_fit();
+                self.own_fit(FitOwner::Publisher);
+                Answer::Fit { step: "cancel", done: true, frames: 0, note: "" }.text()
+            }
+            Command::Fit(FitRequest::Finish { name }) => {
+                let report = solver.finish_fit(name.as_ref()).map_err(|error| ErrorMessage::new(error.code(), error.to_string()))?;
+                let mut warnings = report.warnings;
+                let kept = self.keep_profile(report.profile.clone(), &mut warnings);
+                Answer::Profile { profile: &report.profile, warnings: &warnings, offers: report.offers, kept }.text()
+            }
+            Command::Profile(choice) => self.use_profile(choice)?,
+        };
+        Ok(Some(answer))
     }
 
-    /// Takes over some settings from the next frame on.
-    pub fn set(&mut self, change: &Settings) -> Result<(), SolveError> {
-        self.pipeline.set(change)
+    fn check_rate(&mut self, command: &Command) -> Result<(), ErrorMessage> {
+        // Other sides begin another search, so these are held to the rate of calibrations, too.
+        let (rate, most, code, what) = match command {
+            Command::Calibrate => (&mut self.calibrations, CALIBRATIONS_PER_SECOND, "too_many_calibrations", "calibrations"),
+            _ => (&mut self.commands, COMMANDS_PER_SECOND, "too_many_settings", "changes of settings"),
+        };
+        if rate.take_if_free(Instant::now()) {
+            return Ok(());
+        }
+        Err(ErrorMessage::new(code, format!("more than {most} {what} a second: this one is left out")))
     }
 
-    /// The settings in use.
-    pub fn settings(&self) -> &Settings {
-        self.pipeline.settings()
+    fn settings_answer(&mut self) -> Utf8Bytes {
+        let solver = self.pipeline.solver();
+        Answer::Settings { settings: solver.settings(), added_delay: solver.added_delay() }.text()
     }
 
-    /// Makes the head's present pose straight ahead; false where no face has been seen yet.
-    pub fn recentre(&mut self) -> bool {
-        self.pipeline.recentre()
+    /// Settings are part of the profile in use.
+    fn settings_changed(&mut self) {
+        let settings: Settings = *self.pipeline.solver().settings();
+        if let Some(profile) = &mut self.profile {
+            self.is_profile_changed |= profile.settings != settings;
+            profile.settings = settings;
+        }
     }
 
-    /// A neutral that has been reached since the last call; it is left with the room.
-    pub fn take_calibrated(&mut self) -> Option<CalibrationReport> {
-        let report = self.pipeline.take_calibrated()?;
-        self.keep_neutral();
-        Some(report)
+    fn use_profile(&mut self, choice: ProfileChoice) -> Result<Utf8Bytes, ErrorMessage> {
+        let is_named = matches!(choice, ProfileChoice::Named(_));
+        let profile = match choice {
+            ProfileChoice::Given(profile) => *profile,
+            ProfileChoice::Named(name) => match self.profiles.named(&name) {
+                Some(profile) => (*profile).clone(),
+                None => return Err(ErrorMessage::new("unknown_profile", UnknownProfile(name).to_string())),
+            },
+        };
+        let warnings = self.pipeline.solver().use_profile(&profile).map_err(|error| ErrorMessage::new("bad_profile", error.to_string()))?;
+        if is_named {
+            // Another server may keep another one of this name.
+            let (session, profile) = (self.session(), &profile);
+            self.place.record(|| Item::Event(SessionEvent::Profile { session, profile: Box::new(profile.clone()) }));
+        }
+        self.save_profile();
+        let kept = RoomName::new(&profile.name).is_ok_and(|name| self.profiles.named(&name).is_some_and(|known| *known == profile));
+        let answer = Answer::Profile { profile: &profile, warnings: &warnings, offers: Settings::default(), kept }.text();
+        self.profile = Some(profile);
+        self.settings_changed();
+        Ok(answer)
+    }
+
+    /// A fresh profile is in use, and kept where the server keeps profiles.
+    fn keep_profile(&mut self, profile: Profile, warnings: &mut Vec<String>) -> bool {
+        let kept = self.profiles.keep(&profile).unwrap_or_else(|error| {
+            tracing::warn!(%error, "profile not kept");
+            warnings.push(error.to_string());
+            false
+        });
+        (self.profile, self.is_profile_changed) = (Some(profile), false);
+        kept
+    }
+
+    /// Keeps what has changed in the profile in use.
+    fn save_profile(&mut self) {
+        if !std::mem::take(&mut self.is_profile_changed) {
+            return;
+        }
+        if let Some(profile) = &self.profile
+            && RoomName::new(&profile.name).is_ok_and(|name| self.profiles.named(&name).is_some())
+            && let Err(error) = self.profiles.keep(profile)
+        {
+            tracing::warn!(%error, "profile not kept");
+        }
+    }
+
+    fn own_fit(&mut self, owner: FitOwner) {
+        if let FitOwner::Control(waits) = std::mem::replace(&mut self.fit_owner, owner) {
+            // Who asked may have gone.
+            let _ =
+                waits.send(Err(ErrorMessage::new("fit_replaced", "another step of the fit was asked for before this one was measured")));
+        }
+    }
+
+    /// What has come about since the last call and is the publisher's to know: a neutral that has been reached, which is left
+    /// with the room, and a step of the fit.
+    pub fn news(&mut self) -> Vec<Told> {
+        let mut news = Vec::new();
+        if let Some(report) = self.pipeline.take_calibrated() {
+            self.keep_neutral();
+            news.push(Ok(Answer::calibrated(report, self.pipeline.added_delay()).text()));
+        }
+        if let Some(outcome) = self.pipeline.solver().take_fit() {
+            let told = match outcome {
+                Ok(report) => Ok(Answer::measured(&report).text()),
+                Err(error) => Err(ErrorMessage::new(error.code(), error.to_string())),
+            };
+            match std::mem::take(&mut self.fit_owner) {
+                FitOwner::Publisher => news.push(told),
+                // Who asked may have gone.
+                FitOwner::Control(waits) => drop(waits.send(told)),
+            }
+        }
+        news
+    }
+
+    /// The next command from elsewhere. May be dropped at its await.
+    pub async fn next_control(&mut self) -> Control {
+        match self.controls.recv().await {
+            Some(control) => control,
+            // The room holds the other end for as long as the place is this source's.
+            None => std::future::pending().await,
+        }
+    }
+
+    /// Does what others have asked for since the last call.
+    pub fn take_controls(&mut self) {
+        while let Ok(control) = self.controls.try_recv() {
+            self.control(control);
+        }
+    }
+
+    /// Does what somebody else asks for.
+    pub fn control(&mut self, Control { command, text, answer }: Control) {
+        let is_calibrate = command == Command::Calibrate;
+        let is_measured = matches!(command, Command::Fit(FitRequest::Measure { .. }));
+        let done = self.command(command);
+        if done.is_ok() {
+            self.place.record(|| Item::Control { slot: self.slot.clone(), text });
+        }
+        let told = match done {
+            Ok(None) if is_measured => return self.own_fit(FitOwner::Control(answer)),
+            Ok(None) if is_calibrate => Ok(Answer::Calibrating.text()),
+            Ok(None) => Ok(self.settings_answer()),
+            Ok(Some(text)) => Ok(text),
+            Err(error) => Err(error),
+        };
+        // Who asked may have gone.
+        let _ = answer.send(told);
     }
 
     /// Leaves the neutral in use with the room.
@@ -172,9 +402,9 @@ impl Source {
         }
     }
 
-    /// What the smoothing adds now.
-    pub fn added_delay(&self) -> DelayReport {
-        self.pipeline.added_delay()
+    /// Name of the profile in use, where it has one.
+    pub fn profile_name(&self) -> Option<&str> {
+        self.profile.as_ref().map(|profile| profile.name.as_str()).filter(|name| !name.is_empty())
     }
 
     /// Number of this session in its room, from 1.
@@ -192,6 +422,7 @@ impl Drop for Source {
     /// What has refined the neutral since it was told of is kept.
     fn drop(&mut self) {
         self.keep_neutral();
+        self.save_profile();
         tracing::info!(room = %self.room(), session = self.session(), frames = self.num_frames, "publisher gone");
     }
 }

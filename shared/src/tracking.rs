@@ -2,6 +2,7 @@
 
 mod binary;
 mod fields;
+mod profile;
 mod reader;
 mod settings;
 mod slot;
@@ -13,6 +14,9 @@ use crate::names::NUM_ARKIT_SHAPES;
 use glam::Vec3;
 
 pub use binary::encode_landmarks;
+pub use profile::{
+    Calibration, FIT_SECONDS, FaceKind, FitRequest, FitStep, PROFILE_VERSION, Profile, ProfileChoice, RANGE_FACTORS, Ranges,
+};
 pub use reader::PublishReader;
 pub use settings::{GroupValues, Settings};
 pub use slot::{ChannelGroup, ChannelGroups, Slot};
@@ -39,6 +43,8 @@ pub struct PublishHello {
     pub settings: Settings,
     /// Start from the neutral face that the room keeps of the same tracker, see [`Self::is_of_same_tracker`].
     pub keep_neutral: bool,
+    /// What is known of the performer.
+    pub profile: Option<ProfileChoice>,
 }
 
 impl PublishHello {
@@ -109,12 +115,23 @@ pub enum PublishMessage {
     Hello(PublishHello),
     /// A frame; it stands in the [`TrackingFrame`] given to [`PublishReader::read`].
     Frame,
+    /// Anything that a publisher, or somebody for it, asks for.
+    Command(Command),
+}
+
+/// What a source is asked for besides taking frames: by its publisher, or over a control socket.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Command {
     /// Take the neutral face now.
     Calibrate,
     /// Change some settings.
     Settings(Settings),
     /// The head's present pose is straight ahead.
     Recentre,
+    /// A step of the guided fit.
+    Fit(FitRequest),
+    /// Use this profile.
+    Profile(ProfileChoice),
 }
 
 /// Why a publish message was refused. `message` names the field and what was expected.

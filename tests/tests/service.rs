@@ -5,6 +5,7 @@
 mod service {
     pub mod bad_input;
     pub mod expressions;
+    pub mod fitting;
     pub mod harness;
     pub mod http;
     pub mod neutral;

@@ -68,15 +68,8 @@ pub(super) fn tracker(easel: &mut Easel) -> Result<Sheet> {
     let mut solved = FaceFrame::at_rest(&character);
     let mut moments: Vec<Moment> = Vec::new();
     while let Some(item) = feed.next_frame(&mut tracked)? {
-        match item {
-            FeedItem::Frame => {}
-            FeedItem::Calibrate => solver.calibrate(),
-            FeedItem::Settings(change) => solver.set(&change)?,
-            FeedItem::Recentre => {
-                solver.recentre();
-            }
-        }
-        if item != FeedItem::Frame {
+        if let FeedItem::Command(command) = item {
+            solver.command(&command)?;
             continue;
         }
         solver.solve(&tracked, &mut solved).map_err(|source| PictureError::Frame {

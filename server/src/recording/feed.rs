@@ -3,7 +3,7 @@
 use super::format::{Entry, SessionEvent, Topic};
 use super::reader::{ReadError, Recording};
 use super::text;
-use rhytid_shared::{PublishReader, TrackingFrame};
+use rhytid_shared::{Profile, PublishReader, TrackingFrame};
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, BufRead, Read};
 use std::path::Path;
@@ -23,6 +23,8 @@ pub struct RecordedSession {
 pub struct RecordedFeed {
     recording: Recording,
     slot: String,
+    /// The profile that the hello or the next command names, which the other end may not keep.
+    profile: Option<Box<Profile>>,
     /// Reads binary messages, which a feed has as text.
     reader: PublishReader,
     frame: TrackingFrame,
@@ -90,14 +92,14 @@ impl RecordedFeed {
         for chunk in 0..recording.chunks().len() {
             let entries = recording.read_chunk(chunk)?;
             for (at, entry) in entries.iter().enumerate() {
-                let Some(SessionEvent::Start { slot, under_way: false, .. }) = event(entry) else { continue };
+                let Some(SessionEvent::Start { slot, under_way: false, profile, .. }) = event(entry) else { continue };
                 if left > 0 {
                     left -= 1;
                     continue;
                 }
                 let (waiting, line, is_over) = (VecDeque::new(), Vec::new(), false);
                 let (reader, frame) = (PublishReader::for_any_character(), TrackingFrame::default());
-                let mut feed = Self { recording, slot, reader, frame, chunk: chunk + 1, waiting, line, at: 0, is_over, range };
+                let mut feed = Self { recording, slot, profile, reader, frame, chunk: chunk + 1, waiting, line, at: 0, is_over, range };
                 feed.gather(&entries[at + 1..], true);
                 return Ok(Ok(feed));
             }
@@ -117,10 +119,7 @@ impl RecordedFeed {
                         let _ = self.reader.read(text, &mut self.frame);
                     }
                     if wants_hello || (self.range[0]..=self.range[1]).contains(&entry.log_time) {
-                        // Line ends are blanks in JSON.
-                        let mut line: Vec<u8> =
-                            entry.data.iter().map(|byte| if matches!(byte, b'\n' | b'\r') { b' ' } else { *byte }).collect();
-                        line.push(b'\n');
+                        let line = self.line_of(&entry.data);
                         self.waiting.push_back(line);
                     }
                     wants_hello = false;
@@ -133,6 +132,18 @@ impl RecordedFeed {
                     }
                     self.is_over |= entry.log_time > self.range[1];
                 }
+                // What others asked for moves the face as well.
+                Topic::Control(slot) if *slot == self.slot => {
+                    if (self.range[0]..=self.range[1]).contains(&entry.log_time) {
+                        let line = self.line_of(&entry.data);
+                        self.waiting.push_back(line);
+                    }
+                }
+                Topic::Session if matches!(event(entry), Some(SessionEvent::Profile { .. })) => {
+                    if let Some(SessionEvent::Profile { profile, .. }) = event(entry) {
+                        self.profile = Some(profile);
+                    }
+                }
                 // The next session of this slot.
                 Topic::Session if matches!(event(entry), Some(SessionEvent::Start { slot, .. }) if slot == self.slot) => {
                     self.is_over = true
@@ -144,6 +155,26 @@ impl RecordedFeed {
             }
         }
     }
+}
+
+impl RecordedFeed {
+    /// A message as a line, with the profile that it names in place of its name.
+    fn line_of(&mut self, message: &[u8]) -> Vec<u8> {
+        let mut line: Vec<u8> = match self.profile.take() {
+            Some(profile) => with_profile(message, &profile).unwrap_or_else(|| message.to_vec()),
+            None => message.to_vec(),
+        };
+        // Line ends are blanks in JSON.
+        line.iter_mut().filter(|byte| matches!(byte, b'\n' | b'\r')).for_each(|byte| *byte = b' ');
+        line.push(b'\n');
+        line
+    }
+}
+
+fn with_profile(message: &[u8], profile: &Profile) -> Option<Vec<u8>> {
+    let mut fields: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(message).ok()?;
+    fields.insert("profile".into(), serde_json::to_value(profile).ok()?);
+    serde_json::to_vec(&fields).ok()
 }
 
 fn event(entry: &Entry) -> Option<SessionEvent> {

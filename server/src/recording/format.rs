@@ -6,6 +6,7 @@
 //! /session            JSON, one `SessionEvent` a message: the recording's first message, and whatever the server put in
 //! /publish/SLOT       a publisher's messages that the server took, verbatim: JSON text (hello, frames, calibrate, settings, …)
 //! /publish/SLOT/bin   the same for binary messages
+//! /control/SLOT       commands to a publisher's solve that others gave and that were taken, verbatim: JSON text
 //! /refused/SLOT       messages that the server refused, verbatim, text or not: they moved nothing
 //! /packets            the packets that went out, in batches (`rhytid_shared::packet::BatchWriter`), each up to a second
 //! ```
@@ -15,6 +16,7 @@
 //! they were made of.
 
 use crate::solve::{Calibration, SolveConfig};
+use rhytid_shared::Profile;
 use rhytid_shared::view::CharacterHello;
 use serde::{Deserialize, Serialize};
 
@@ -36,6 +38,8 @@ pub enum Topic {
     Text(String),
     /// `/publish/SLOT/bin`.
     Binary(String),
+    /// `/control/SLOT`.
+    Control(String),
     /// `/refused/SLOT`.
     Refused(String),
 }
@@ -48,6 +52,7 @@ impl Topic {
             Self::Packets => "/packets".into(),
             Self::Text(slot) => format!("/publish/{slot}"),
             Self::Binary(slot) => format!("/publish/{slot}/bin"),
+            Self::Control(slot) => format!("/control/{slot}"),
             Self::Refused(slot) => format!("/refused/{slot}"),
         }
     }
@@ -62,6 +67,9 @@ impl Topic {
         if let Some(slot) = name.strip_prefix("/refused/") {
             return Some(Self::Refused(slot.into()));
         }
+        if let Some(slot) = name.strip_prefix("/control/") {
+            return Some(Self::Control(slot.into()));
+        }
         let slot = name.strip_prefix("/publish/")?;
         Some(match slot.strip_suffix("/bin") {
             Some(slot) => Self::Binary(slot.into()),
@@ -72,7 +80,7 @@ impl Topic {
     /// MCAP's message encoding.
     pub(super) fn encoding(&self) -> &'static str {
         match self {
-            Self::Session | Self::Text(_) => "json",
+            Self::Session | Self::Text(_) | Self::Control(_) => "json",
             Self::Packets => "rhytid.packets.v1",
             Self::Binary(_) => "rhytid.publish.v1",
             Self::Refused(_) => "application/octet-stream",
@@ -123,8 +131,17 @@ pub enum SessionEvent {
         under_way: bool,
         /// The neutral face that the session began with, where the room had kept one.
         kept_neutral: Option<Box<Calibration>>,
+        /// The profile of the performer that the session began with, whoever named it.
+        profile: Option<Box<Profile>>,
         /// The server's settings of the solve; nothing where it cannot be solved again.
         solve: Option<Box<SolveConfig>>,
+    },
+    /// The profile that the next message names.
+    Profile {
+        /// The session's number.
+        session: u32,
+        /// The profile.
+        profile: Box<Profile>,
     },
     /// A session has come to a neutral face.
     Neutral {

@@ -253,9 +253,18 @@ impl Seat {
         let recorded = |session| {
             let (slot, source) = (claim.slot.name.clone(), claim.source.clone());
             // Its packets are recorded, and no messages that they could be solved from.
-            vec![Item::Event(SessionEvent::Start { session, slot, source, under_way: true, kept_neutral: None, solve: None })]
+            vec![Item::Event(SessionEvent::Start {
+                session,
+                slot,
+                source,
+                under_way: true,
+                kept_neutral: None,
+                profile: None,
+                solve: None,
+            })]
         };
-        let (place, evicted) = hub.rooms.claim(room, claim.clone(), recorded)?;
+        // Nobody commands it as they would a tracker.
+        let (place, evicted) = hub.rooms.claim(room, claim.clone(), tokio::sync::mpsc::channel(1).0, recorded)?;
         Ok(Self { place, evicted })
     }
 }

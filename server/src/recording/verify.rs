@@ -8,7 +8,7 @@ use crate::solve::mix::Mixer;
 use crate::solve::{Calibration, SolveConfig};
 use rhytid_shared::packet::{BatchReader, Decoder, Encoder};
 use rhytid_shared::view::CharacterHello;
-use rhytid_shared::{ARKIT_NAMES, Character, FaceFrame, PublishMessage, PublishReader, TrackingFrame};
+use rhytid_shared::{ARKIT_NAMES, Character, Command, FaceFrame, Profile, ProfileChoice, PublishMessage, PublishReader, TrackingFrame};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
@@ -154,6 +154,8 @@ struct Solving {
     session: u32,
     config: Box<SolveConfig>,
     kept: Option<Box<Calibration>>,
+    /// The profile that the hello, and later that the next command, names.
+    profile: Option<Box<Profile>>,
     reader: PublishReader,
     /// Once its hello has been read.
     pipeline: Option<Pipeline>,
@@ -198,7 +200,7 @@ impl Run<'_> {
     fn take(&mut self, recording: &Recording, entry: &Entry) -> Result<(), VerifyError> {
         match &entry.topic {
             Topic::Session => self.event(recording, entry),
-            Topic::Text(slot) | Topic::Binary(slot) => self.message(recording, slot, entry),
+            Topic::Text(slot) | Topic::Binary(slot) | Topic::Control(slot) => self.message(recording, slot, entry),
             Topic::Packets => {
                 let mut packets = Vec::new();
                 let read = self.batches.unpack(&entry.data, |_, packet| packets.push(packet.to_vec()));
@@ -212,13 +214,15 @@ impl Run<'_> {
     fn event(&mut self, recording: &Recording, entry: &Entry) -> Result<(), VerifyError> {
         let event = serde_json::from_slice(&entry.data).map_err(|error| recording.broken(format!("a session event: {error}")))?;
         match event {
-            SessionEvent::Start { session, slot, under_way: false, kept_neutral, solve: Some(config), .. } if self.blind.is_empty() => {
+            SessionEvent::Start { session, slot, under_way: false, kept_neutral, profile, solve: Some(config), .. }
+                if self.blind.is_empty() =>
+            {
                 let reader = PublishReader::new(self.character);
                 if self.slots.is_empty() {
                     self.first.get_or_insert(session);
                 }
                 self.merging.last_session = session;
-                let solving = Solving { session, config, kept: kept_neutral, reader, pipeline: None };
+                let solving = Solving { session, config, kept: kept_neutral, profile, reader, pipeline: None };
                 if let Some(before) = self.slots.insert(slot, solving) {
                     // Its end should have been said.
                     self.merging.mixer.leave(before.session);
@@ -240,6 +244,11 @@ impl Run<'_> {
                     self.merging.mixer.leave(session);
                 }
             }
+            SessionEvent::Profile { session, profile } => {
+                if let Some(solving) = self.slots.values_mut().find(|solving| solving.session == session) {
+                    solving.profile = Some(profile);
+                }
+            }
             SessionEvent::Gap { messages } => {
                 let (seconds, frames) = (self.seconds(entry), self.report.frames);
                 return Err(VerifyError::Gap { seconds, messages, frames });
@@ -258,15 +267,17 @@ impl Run<'_> {
         let Some(solving) = self.slots.get_mut(slot) else { return Ok(()) };
         let session = solving.session;
         let refused = |problem: String| VerifyError::Refused { session, seconds, problem };
-        let read = if matches!(entry.topic, Topic::Binary(_)) {
-            solving.reader.read_binary(&entry.data, &mut self.frame)
-        } else {
-            let text = std::str::from_utf8(&entry.data).map_err(|error| refused(error.to_string()))?;
-            solving.reader.read(text, &mut self.frame)
+        let text = || std::str::from_utf8(&entry.data).map_err(|error| refused(error.to_string()));
+        let is_control = matches!(entry.topic, Topic::Control(_));
+        let read = match &entry.topic {
+            Topic::Binary(_) => solving.reader.read_binary(&entry.data, &mut self.frame),
+            Topic::Control(_) => PublishReader::read_command(text()?).map(PublishMessage::Command),
+            _ => solving.reader.read(text()?, &mut self.frame),
         };
         let message = read.map_err(|error| refused(error.message))?;
         let Some(pipeline) = &mut solving.pipeline else {
-            let PublishMessage::Hello(hello) = message else { return Err(refused("expected a hello first".into())) };
+            let PublishMessage::Hello(mut hello) = message else { return Err(refused("expected a hello first".into())) };
+            hello.profile = solving.profile.take().map(ProfileChoice::Given);
             let character = self.character.clone();
             let pipeline = match solving.kept.take() {
                 Some(kept) => Pipeline::with_calibration(character, &solving.config, &hello, session, *kept),
@@ -282,6 +293,7 @@ impl Run<'_> {
                 pipeline.solve(&self.frame).map_err(|error| refused(error.to_string()))?;
                 let Merging { mixer, last_session, encoder, encoded_session } = &mut self.merging;
                 let now = mixer_time(recording.room_nanos(entry.log_time));
+                news(pipeline);
                 let Some(merged) = mixer.take(session, pipeline.face(), now, last_session) else { return Ok(()) };
                 if merged.session != *encoded_session {
                     *encoder = Encoder::new(&**self.character);
@@ -295,11 +307,14 @@ impl Run<'_> {
                 }
                 self.solved.push_back(packet);
             }
-            PublishMessage::Calibrate => pipeline.calibrate(),
-            PublishMessage::Settings(change) => pipeline.set(&change).map_err(|error| refused(error.to_string()))?,
-            PublishMessage::Recentre => {
-                if !pipeline.recentre() {
-                    return Err(refused("no face has been seen yet, expected one to re-centre".into()));
+            PublishMessage::Command(mut command) => {
+                if let Command::Profile(choice @ ProfileChoice::Named(_)) = &mut command {
+                    let profile = solving.profile.take().ok_or_else(|| refused("the profile that it names is not there".into()))?;
+                    *choice = ProfileChoice::Given(profile);
+                }
+                pipeline.command(&command).map_err(|error| refused(error.to_string()))?;
+                if !is_control {
+                    news(pipeline);
                 }
             }
             PublishMessage::Hello(_) => return Err(refused("expected one hello".into())),
@@ -354,6 +369,12 @@ impl Run<'_> {
             report => Ok(report),
         }
     }
+}
+
+/// Takes what a server tells its publisher after each message: a solve remembers what has not been taken.
+fn news(pipeline: &mut Pipeline) {
+    pipeline.take_calibrated();
+    pipeline.solver().take_fit();
 }
 
 /// Packets read one after the other.

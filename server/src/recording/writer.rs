@@ -118,6 +118,11 @@ pub(crate) enum Item {
         t: Option<f64>,
         bytes: Bytes,
     },
+    /// A command that somebody else gave.
+    Control {
+        slot: Arc<str>,
+        text: Utf8Bytes,
+    },
     /// A message that was refused.
     Refused {
         slot: Arc<str>,
@@ -132,7 +137,7 @@ impl Item {
         match self {
             // Hellos of characters and neutrals: a few KB, seldom.
             Self::Event(_) => 4096,
-            Self::Text { text, .. } => text.len(),
+            Self::Text { text, .. } | Self::Control { text, .. } => text.len(),
             Self::Binary { bytes, .. } | Self::Refused { bytes, .. } | Self::Packet(bytes) => bytes.len(),
         }
     }
@@ -548,6 +553,7 @@ impl<W: Write> RecordingWriter<W> {
             Item::Event(event) => self.event(at, &event),
             Item::Text { slot, t, text } => self.message(&Topic::Text(slot.to_string()), at, t, text.as_bytes()),
             Item::Binary { slot, t, bytes } => self.message(&Topic::Binary(slot.to_string()), at, t, &bytes),
+            Item::Control { slot, text } => self.message(&Topic::Control(slot.to_string()), at, None, text.as_bytes()),
             Item::Refused { slot, bytes } => self.message(&Topic::Refused(slot.to_string()), at, None, &bytes),
             Item::Packet(bytes) => self.put_packet(at, bytes),
         }

@@ -1,7 +1,7 @@
 //! One performer's landmarks through a session: head pose, neutral, smoothing, retargeting.
 
 use super::DelayReport;
-use super::calibration::{self, Calibration, Calibrator, Found, ibug_strain};
+use super::calibration::{self, Calibrator, Found, ibug_strain};
 use super::config::{FilterConfig, SolveConfig};
 use super::depth::Shape;
 use super::easing::FaceState;
@@ -17,7 +17,7 @@ use super::rotation;
 use glam::{DQuat, DVec2, DVec3};
 use rhytid_shared::layout::Layout;
 use rhytid_shared::limits::MAX_HEAD_TRAVEL;
-use rhytid_shared::{Character, PublishHello};
+use rhytid_shared::{Calibration, Character, PublishHello};
 use std::sync::Arc;
 
 /// A head pose that fits badly is refused for this long, seconds; what lasts longer is no outlier.
@@ -71,6 +71,8 @@ pub(super) struct LandmarkSession {
     retarget: Option<Retarget>,
     /// Head rotation and place that count as straight ahead, where the publisher has said so since the neutral.
     centre: Option<(DQuat, DVec3)>,
+    /// The next face looks straight ahead.
+    is_centre_wanted: bool,
     /// Where weights are wanted and can be told.
     estimator: Option<Estimator>,
 }
@@ -134,6 +136,7 @@ impl LandmarkSession {
             calibration: None,
             retarget: None,
             centre: None,
+            is_centre_wanted: false,
             estimator: if config.estimate_weights { Estimator::new(character, &points) } else { None },
             prior: model.iter().map(|point| point.z).collect(),
             believed_spread: (0..num)
@@ -186,7 +189,7 @@ impl LandmarkSession {
         let is_adopted = self.adopt(character, found.calibration).is_ok();
         if is_adopted {
             if is_requested {
-                self.centre = None;
+                (self.centre, self.is_centre_wanted) = (None, false);
             }
             self.calibrator.accepted(is_requested);
         } else {
@@ -240,6 +243,11 @@ impl LandmarkSession {
         true
     }
 
+    /// As [`Self::recentre`], with the next face.
+    pub(super) fn recentre_next(&mut self) {
+        self.is_centre_wanted = true;
+    }
+
     pub(super) fn added_delay(&self) -> DelayReport {
         DelayReport {
             brows: self.brows.bank.delay(),
@@ -286,6 +294,10 @@ impl LandmarkSession {
                 }
             }
             self.settle();
+        }
+        if self.is_centre_wanted && !is_refused {
+            self.is_centre_wanted = false;
+            self.recentre();
         }
         self.smooth(dt);
         if let Some(retarget) = &mut self.retarget {

@@ -33,6 +33,7 @@ impl Solver {
                 None => None,
             };
             self.weights = WeightSession::new(&self.character, &config);
+            self.weights.set_factors(&self.range_rig.of_shapes());
             self.sent_head = SentHead::new(is_mirrored);
             self.sent_calibration = None;
             self.blend = Some(self.config.calibration.blend);
@@ -110,6 +111,24 @@ impl Amplifier {
         Self { gains: [1.0; 5], bones: bones.collect() }
     }
 
+    /// Keeps bones that turn within what they can.
+    pub(super) fn limit(&self, motions: &mut [glam::Vec3]) {
+        for (motion, (_, range)) in motions.iter_mut().zip(&self.bones) {
+            match *range {
+                Range::Free => {}
+                Range::Lid(shut) => {
+                    if motion.x / shut > 1.0 {
+                        motion.x = shut;
+                    }
+                }
+                Range::Angles([pitch, yaw]) => {
+                    motion.x = motion.x.clamp(-pitch.abs(), pitch.abs());
+                    motion.y = motion.y.clamp(-yaw.abs(), yaw.abs());
+                }
+            }
+        }
+    }
+
     /// Applies the gains; where all are 1 no bit changes.
     pub(super) fn amplify(&self, state: &mut FaceState) {
         if self.gains == [1.0; 5] {
@@ -151,7 +170,7 @@ impl Amplifier {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rhytid_shared::{DEFAULT_CHARACTER_GLB, FaceFrame, PublishHello, PublishMessage, PublishReader, TrackingFrame};
+    use rhytid_shared::{DEFAULT_CHARACTER_GLB, FaceFrame, PublishMessage, PublishReader, TrackingFrame};
     use std::sync::Arc;
 
     /// The face after thirty frames of these weights, under these settings.
@@ -207,11 +226,10 @@ mod tests {
         let mut reader = PublishReader::for_any_character();
         let mut frame = TrackingFrame::default();
         reader.read(r#"{"type":"hello","version":1}"#, &mut frame).unwrap();
-        let Ok(PublishMessage::Settings(change)) = reader.read(r#"{"type":"settings","gains":{"mouth":0}}"#, &mut frame) else { panic!() };
-        solver.set(&change).unwrap();
+        let Ok(PublishMessage::Command(change)) = reader.read(r#"{"type":"settings","gains":{"mouth":0}}"#, &mut frame) else { panic!() };
+        solver.command(&change).unwrap();
         reader.read(r#"{"type":"frame","t":2,"weights":{"jawOpen":0.4}}"#, &mut frame).unwrap();
         solver.solve(&frame, &mut out).unwrap();
         assert_eq!(weight(&out, "jawOpen"), 0.0);
-        let _ = PublishHello::default();
     }
 }

@@ -1,16 +1,16 @@
 //! One sender's expression weights through a session: mirroring, neutral, smoothing, bones.
 
-use super::calibration::Calibration;
 use super::config::{OneEuroConfig, SolveConfig};
 use super::easing::FaceState;
 use super::error::SolveError;
 use super::filter::OneEuroBank;
 use super::mix::group_of_shape;
+use super::ranges::stretched;
 use super::rotation;
 use super::weights_to_bones::{WeightRig, Weights};
 use glam::{DQuat, DVec3};
 use rhytid_shared::limits::MAX_HEAD_TRAVEL;
-use rhytid_shared::{ARKIT_NAMES, ArkitShape, ChannelGroup, Character, HeadPose, NUM_ARKIT_SHAPES};
+use rhytid_shared::{ARKIT_NAMES, ArkitShape, Calibration, ChannelGroup, Character, HeadPose, NUM_ARKIT_SHAPES};
 
 /// Largest weight a tracker may give: some overshoot on strong faces.
 const LARGEST_WEIGHT: f32 = 1.2;
@@ -28,6 +28,10 @@ pub(super) struct WeightSession {
     last_t: Option<f64>,
     /// As the sender gave them last.
     last: Option<Box<Weights>>,
+    /// Smoothed, about the neutral, before they are stretched.
+    seen: Box<Weights>,
+    /// What each weight is stretched by.
+    factors: Box<Weights>,
 }
 
 impl WeightSession {
@@ -45,7 +49,24 @@ impl WeightSession {
             neutral: Box::new([0.0; NUM_ARKIT_SHAPES]),
             last_t: None,
             last: None,
+            seen: Box::new([0.0; NUM_ARKIT_SHAPES]),
+            factors: Box::new([1.0; NUM_ARKIT_SHAPES]),
         }
+    }
+
+    /// What moves the bones.
+    pub(super) fn rig(&self) -> &WeightRig {
+        &self.rig
+    }
+
+    /// Stretches each weight from the next frame on.
+    pub(super) fn set_factors(&mut self, factors: &Weights) {
+        *self.factors = *factors;
+    }
+
+    /// The last frame's weights, smoothed, about the neutral, before they are stretched.
+    pub(super) fn seen(&self) -> &Weights {
+        &self.seen
     }
 
     pub(super) fn restore(&mut self, neutral: &[f32]) {
@@ -113,6 +134,10 @@ impl WeightSession {
             None => self.last = Some(Box::new(seen)),
         }
         self.last_t = Some(t);
+        *self.seen = smoothed;
+        for (weight, factor) in smoothed.iter_mut().zip(self.factors.iter()) {
+            *weight = stretched(*weight, *factor, 1.0);
+        }
         self.rig.solve(&smoothed, &mut state.motions);
         state.weights = Some(smoothed.map(|weight| weight.clamp(0.0, 1.0)));
         state.is_placed = false;
@@ -138,11 +163,13 @@ pub(super) struct SentHead {
     neutral_rotation: DQuat,
     neutral_position: DVec3,
     last: Option<(DQuat, DVec3)>,
+    /// The next head looks straight ahead.
+    is_centre_wanted: bool,
 }
 
 impl SentHead {
     pub(super) fn new(mirror: bool) -> Self {
-        Self { mirror, neutral_rotation: DQuat::IDENTITY, neutral_position: DVec3::ZERO, last: None }
+        Self { mirror, neutral_rotation: DQuat::IDENTITY, neutral_position: DVec3::ZERO, last: None, is_centre_wanted: false }
     }
 
     pub(super) fn restore(&mut self, calibration: &Calibration) {
@@ -156,6 +183,11 @@ impl SentHead {
             (self.neutral_rotation, self.neutral_position) = (rotation, position);
         }
         (self.neutral_rotation, self.neutral_position)
+    }
+
+    /// Takes the next head as neutral.
+    pub(super) fn recentre_next(&mut self) {
+        self.is_centre_wanted = true;
     }
 
     /// Checks a head before anything is changed by its frame.
@@ -182,6 +214,9 @@ impl SentHead {
             p.x = -p.x;
         }
         self.last = Some((q, p));
+        if std::mem::take(&mut self.is_centre_wanted) {
+            self.calibrate();
+        }
         let back = self.neutral_rotation.inverse();
         let turn = rotation::to_vector(back * q);
         let shift = rotation::rotate(back, p - self.neutral_position);

@@ -155,11 +155,7 @@ impl Scenes {
         loop {
             match self.feed.next_frame(&mut self.frame)? {
                 None => return Ok(None),
-                Some(FeedItem::Calibrate) => self.pipeline.calibrate(),
-                Some(FeedItem::Settings(change)) => self.pipeline.set(&change)?,
-                Some(FeedItem::Recentre) => {
-                    self.pipeline.recentre();
-                }
+                Some(FeedItem::Command(command)) => self.pipeline.command(&command)?,
                 Some(FeedItem::Frame) => return Ok(Some((self.frame.t, self.scene()?))),
             }
         }

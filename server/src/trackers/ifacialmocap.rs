@@ -14,6 +14,9 @@ use std::fmt::Write;
 
 /// Largest datagram, bytes: one of 52 shapes takes 1,100, Facemotion3d has some more.
 pub const LARGEST: usize = 8192;
+/// Shapes that a text without a head must have: the tail may be missing, but what was cut among the shapes would put the rest
+/// of the face to rest.
+const FEWEST_ALONE: usize = 40;
 /// The text that starts iFacialMocap.
 const HELLO: &str = "iFacialMocap_sahuasouryya9218sauhuiayeta91555dy3719";
 /// The text that starts and the one that stops Facemotion3d.
@@ -57,13 +60,16 @@ pub fn parse(bytes: &[u8]) -> Result<Seen, Refusal> {
     }
     let text = std::str::from_utf8(bytes).map_err(|_| Refusal::Malformed)?;
     let mut sheet = WeightSheet::new();
-    let (mut is_tracking, mut head, mut eyes) = (true, None, [None; 2]);
+    let (mut is_tracking, mut has_head, mut head, mut eyes) = (true, false, None, [None; 2]);
     // Streams exist with "…|=head#…", "…=head#…" and "…|=|head#…".
     let mut tokens = text.split(['|', '=']).map(str::trim).filter(|token| !token.is_empty()).peekable();
     while let Some(token) = tokens.next() {
         let is_last = tokens.peek().is_none();
         let read = match token.split_once('#') {
-            Some(("head", values)) => numbers::<6>(values).map(|values| head = values.or(head)),
+            Some(("head", values)) => {
+                has_head = true;
+                numbers::<6>(values).map(|values| head = values.or(head))
+            }
             Some(("leftEye", values)) => numbers::<3>(values).map(|values| eyes[0] = values.or(eyes[0])),
             Some(("rightEye", values)) => numbers::<3>(values).map(|values| eyes[1] = values.or(eyes[1])),
             // Bones and names of other programs.
@@ -81,6 +87,9 @@ pub fn parse(bytes: &[u8]) -> Result<Seen, Refusal> {
     }
     if sheet.num_known == 0 {
         return Err(Refusal::NoContent);
+    }
+    if !has_head && sheet.num_known < FEWEST_ALONE {
+        return Err(Refusal::Malformed);
     }
     let pose = head.map(|[x, y, z, right, up, front]: [f32; 6]| {
         Ok((rotation(x.to_radians(), y.to_radians(), z.to_radians())?, position(Vec3::new(right, up, front))?))
@@ -196,8 +205,11 @@ mod tests {
         assert_eq!(parse(b"jawOpen-10|trackingStatus-0|").unwrap().sight, Sight::NoFace);
         let seen = weights_of("jawOpen-10|jawLeft-3|=head#1,2");
         assert_eq!((of(&seen, "jawOpen"), seen.head_rotation), (0.1, None));
-        assert_eq!(of(&weights_of("jawOpen-10|mouthCl"), "jawOpen"), 0.1);
-        assert_eq!(of(&weights_of("jawOpen&-3|mouthClose&7"), "jawOpen"), 0.0);
+        assert_eq!(of(&weights_of("jawOpen&-3|mouthClose&7|=head#0,0,0"), "jawOpen"), 0.0);
+        // Without its head a text still has its shapes; one that ends among them would put the others to rest.
+        let whole = String::from_utf8(write(Dialect::V1, &[0.1; NUM_ARKIT_SHAPES], Quat::IDENTITY, Vec3::ZERO)).unwrap();
+        assert_eq!(of(&weights_of(whole.split('=').next().unwrap()), "jawOpen"), 0.1);
+        assert_eq!(parse(&whole.as_bytes()[..whole.len() / 2]), Err(Refusal::Malformed));
     }
 
     #[test]

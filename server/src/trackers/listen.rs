@@ -394,8 +394,9 @@ impl<'a> Listener<'a> {
         match live.source.frame(self.hub, live.framer.frame(t, &seen.sight), None) {
             Ok(()) => {
                 self.hub.metrics.tracker_frame(protocol.name());
+                live.source.take_controls();
                 // Nobody is to be told; the room keeps it.
-                live.source.take_calibrated();
+                live.source.news();
                 Ok(())
             }
             Err(FrameError::Evicted) => {
@@ -461,7 +462,7 @@ impl<'a> Listener<'a> {
             Err(error) => {
                 tracing::debug!(%room, source = performer.source, %error, "tracker has no room");
                 let refusal = match error {
-                    OpenError::Hello(_) => "bad_frame",
+                    OpenError::Hello(_) | OpenError::Profile(_) => "bad_frame",
                     OpenError::Room(error) => error.code(),
                 };
                 performer.lose_slot(now, refusal);
@@ -475,6 +476,7 @@ impl<'a> Listener<'a> {
         let idle = seconds(self.hub.config.timeouts.publisher_idle);
         self.performers.retain(|_, performer| now - performer.last_heard < idle);
         self.senders.retain(|_, sender| now - sender.last_heard < idle);
+        self.performers.values_mut().filter_map(|performer| performer.live.as_mut()).for_each(|live| live.source.take_controls());
         let at = self.seconds(now);
         let mut has_stream = false;
         for (from, sender) in &mut self.senders {

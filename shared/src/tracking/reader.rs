@@ -1,13 +1,15 @@
 //! One publish session's messages, checked in their order.
 
 use super::binary;
-use super::fields::{Fields, Kind, LayoutField};
-use super::{MessageError, PublishHello, PublishMessage, Settings, Slot, TrackingData, TrackingFrame};
+use super::fields::{Fields, Kind, LayoutField, cut};
+use super::{
+    Command, FIT_SECONDS, FitRequest, FitStep, MessageError, PublishHello, PublishMessage, Settings, Slot, TrackingData, TrackingFrame,
+};
 use crate::character::Character;
 use crate::face::HeadPose;
 use crate::layout::Layout;
 use crate::limits::{FOCAL_RANGE, MAX_FEATURE_POINTS, MAX_SECONDS};
-use crate::names::NUM_ARKIT_SHAPES;
+use crate::names::{NUM_ARKIT_SHAPES, RoomName};
 use crate::view::PROTOCOL_VERSION;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,6 +17,15 @@ use std::collections::{BTreeMap, BTreeSet};
 const MAX_IMAGE: f64 = 1e5;
 /// Most frames a second a hello may claim: faster than any face camera.
 const MAX_FPS: f64 = 1000.0;
+
+/// Types of a publisher's messages, for errors.
+pub(super) const TYPES: &str = "\"hello\", \"frame\", \"calibrate\", \"recentre\", \"settings\", \"fit\" or \"profile\"";
+/// Types of commands, for errors.
+const COMMANDS: &str = "\"calibrate\", \"recentre\", \"settings\", \"fit\" or \"profile\"";
+/// Steps of the fit, for errors.
+const STEPS: &str = "neutral, brows_up, frown, smile, pucker, jaw_open, blink, mouth_left, finish or cancel";
+/// How long a step measures where nothing is said.
+const DEFAULT_FIT_SECONDS: f64 = 1.5;
 
 /// Reads the text messages of one publish session, or the lines of a feed file, without building a tree of JSON.
 #[derive(Debug, Clone)]
@@ -60,7 +71,7 @@ impl PublishReader {
         if let Some(problem) = self.fields.problem.take() {
             return Err(problem);
         }
-        let kind = self.fields.kind.ok_or_else(|| missing("type", "\"hello\", \"frame\" or \"calibrate\""))?;
+        let kind = self.fields.kind.ok_or_else(|| missing("type", TYPES))?;
         match (kind, &self.hello) {
             (Kind::Hello, Some(_)) => {
                 Err(MessageError::new("repeated_hello", "field type is \"hello\" a second time, expected one hello a session"))
@@ -71,14 +82,20 @@ impl PublishReader {
                 Ok(PublishMessage::Hello(hello))
             }
             (_, None) => Err(MessageError::new("no_hello", "the first message must be {\"type\":\"hello\",\"version\":1,…}")),
-            (Kind::Calibrate, Some(_)) => Ok(PublishMessage::Calibrate),
-            (Kind::Recentre, Some(_)) => Ok(PublishMessage::Recentre),
-            (Kind::Settings, Some(_)) => {
-                self.fields.change.check()?;
-                Ok(PublishMessage::Settings(self.fields.change))
-            }
             (Kind::Frame, Some(_)) => self.check_frame(frame).map(|()| PublishMessage::Frame),
+            (kind, Some(_)) => check_command(kind, &mut self.fields).map(PublishMessage::Command),
         }
+    }
+
+    /// Reads one message of a control socket, which brings no frames and needs no hello.
+    pub fn read_command(text: &str) -> Result<Command, MessageError> {
+        let mut fields = Fields::new();
+        fields.read(text, None)?;
+        if let Some(problem) = fields.problem.take() {
+            return Err(problem);
+        }
+        let kind = fields.kind.ok_or_else(|| missing("type", COMMANDS))?;
+        check_command(kind, &mut fields)
     }
 
     /// Reads one binary message, which is a landmark frame (see `encode_landmarks`). After an error `frame` is as it was.
@@ -139,6 +156,7 @@ impl PublishReader {
             settings: check_settings(fields.settings)?,
             slot: Slot::check(fields.slot.take(), fields.priority, fields.groups)?,
             keep_neutral: fields.keep_neutral,
+            profile: fields.profile.take(),
         })
     }
 
@@ -209,6 +227,50 @@ impl PublishReader {
         self.t_before = self.last_t.replace(t);
         Ok(())
     }
+}
+
+/// What a command's fields say.
+fn check_command(kind: Kind, fields: &mut Fields) -> Result<Command, MessageError> {
+    match kind {
+        Kind::Calibrate => Ok(Command::Calibrate),
+        Kind::Recentre => Ok(Command::Recentre),
+        Kind::Settings => {
+            fields.change.check()?;
+            Ok(Command::Settings(fields.change))
+        }
+        Kind::Profile => {
+            let choice = fields.profile.take().ok_or_else(|| missing("profile", "a profile, or the name of one that the server keeps"))?;
+            Ok(Command::Profile(choice))
+        }
+        Kind::Fit => check_fit(fields).map(Command::Fit),
+        Kind::Hello | Kind::Frame => {
+            Err(MessageError::new("unknown_type", format!("field type is that of a publisher, expected {COMMANDS}")))
+        }
+    }
+}
+
+fn check_fit(fields: &mut Fields) -> Result<FitRequest, MessageError> {
+    let step = fields.step.take().ok_or_else(|| missing("step", STEPS))?;
+    let out_of_range = |message: String| Err(MessageError::new("out_of_range", message));
+    match step.as_str() {
+        "cancel" => return Ok(FitRequest::Cancel),
+        "finish" => {
+            let Some(name) = fields.name.take() else { return Ok(FitRequest::Finish { name: None }) };
+            return match RoomName::new(&name) {
+                Ok(name) => Ok(FitRequest::Finish { name: Some(name) }),
+                Err(_) => out_of_range(format!("field name is {:?}, expected 1 to 64 characters of A-Z a-z 0-9 _ -", cut(&name))),
+            };
+        }
+        _ => {}
+    }
+    let Some(step) = FitStep::from_name(&step) else { return out_of_range(format!("field step is {:?}, expected {STEPS}", cut(&step))) };
+    let [least, most] = FIT_SECONDS;
+    let seconds = fields.seconds.unwrap_or(DEFAULT_FIT_SECONDS);
+    // A NaN is in no range.
+    if !(least..=most).contains(&seconds) {
+        return out_of_range(format!("field seconds is {seconds}, expected {least} to {most}"));
+    }
+    Ok(FitRequest::Measure { step, seconds })
 }
 
 fn check_settings(settings: Option<Settings>) -> Result<Settings, MessageError> {
@@ -366,7 +428,7 @@ mod tests {
         let got = read(r#"{"type":"frame","t":2,"bones":{"brow_r":[0,0.05,0.1]}}"#);
         assert_eq!(got.data, TrackingData::Bones { points: vec![(1, Vec3::new(0.0, 0.05, 0.1))], head: None });
         assert_eq!(read(r#"{"type":"frame","t":3,"face":false}"#).data, TrackingData::NoFace);
-        assert_eq!(reader.read(r#"{"type":"calibrate"}"#, &mut frame), Ok(PublishMessage::Calibrate));
+        assert_eq!(reader.read(r#"{"type":"calibrate"}"#, &mut frame), Ok(PublishMessage::Command(Command::Calibrate)));
     }
 
     #[test]

@@ -25,6 +25,7 @@ fn options(server: &Server, text: String) -> SendOptions {
         repeats: false,
         takeover: false,
         binary: false,
+        profile: None,
         timeout: Duration::from_secs(15),
         trust: Trust::Public,
     }
