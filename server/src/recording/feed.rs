@@ -133,11 +133,9 @@ impl RecordedFeed {
                     self.is_over |= entry.log_time > self.range[1];
                 }
                 // What others asked for moves the face as well.
-                Topic::Control(slot) if *slot == self.slot => {
-                    if (self.range[0]..=self.range[1]).contains(&entry.log_time) {
-                        let line = self.line_of(&entry.data);
-                        self.waiting.push_back(line);
-                    }
+                Topic::Control(slot) if *slot == self.slot && (self.range[0]..=self.range[1]).contains(&entry.log_time) => {
+                    let line = self.line_of(&entry.data);
+                    self.waiting.push_back(line);
                 }
                 Topic::Session if matches!(event(entry), Some(SessionEvent::Profile { .. })) => {
                     if let Some(SessionEvent::Profile { profile, .. }) = event(entry) {
