@@ -6,6 +6,7 @@ import { Panel } from "./panel.js";
 import { Puppet } from "./puppet.js";
 import { RoomPicker } from "./rooms.js";
 import { listenForCopies, showLinks } from "./share.js";
+import { Sources } from "./sources.js";
 import { Stage, expressionNames, fetchCharacter } from "./stage.js";
 import { byId, element, roomOfAddress, storage, wallClock } from "./util.js";
 import { ViewLink } from "./view_link.js";
@@ -58,15 +59,17 @@ let wrinklesBefore = "own";
 let blend = 0;
 const times = new PacketTimes();
 
-const panel = new Panel(["camera", "puppet", "inspect", "share"], (name) => shownTab(name));
+const panel = new Panel(["camera", "puppet", "sources", "inspect", "share"], (name) => shownTab(name));
 const inspector = new Inspector(byId("page-inspect"));
 const puppet = new Puppet(byId("page-puppet"), (t, sent) => inspector.frameSent(t, sent, sent));
+const sources = new Sources(byId("page-sources"), room);
 const picker = new RoomPicker((name) => enter(name, true));
 
 function shownTab(/** @type {string | null} */ name) {
   // Called by the panel before what follows it is there.
   queueMicrotask(() => {
     inspector.setOpen(name === "inspect");
+    sources.setOpen(name === "sources");
     if (name === "camera") openCamera();
     if (name === "share") showLinks(room);
   });
@@ -112,6 +115,7 @@ function enter(name, isNew) {
   document.title = `${name} · Rhytid`;
   picker.current = name;
   puppet.enter(name);
+  sources.enter(name);
   tellCamera({ type: "room", room: name });
   if (!byId("page-share").hidden) showLinks(name);
   link?.close();

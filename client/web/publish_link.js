@@ -1,5 +1,6 @@
 // The socket that publishes: hello, frames, settings and questions. It comes back by itself, unless somebody else has the room.
 
+import { Questions } from "./questions.js";
 import { Backoff, SUBPROTOCOL, socketUrl } from "./util.js";
 
 /**
@@ -34,14 +35,11 @@ export class PublishLink {
     /** @type {WebSocket | null} */
     this.socket = null;
     this.timer = 0;
-    /** The server takes binary frames, as far as is known. */
-    this.takesBinary = true;
     this.wasReadyAt = -Infinity;
     this.numFrames = 0;
     this.numSkipped = 0;
     this.bytes = 0;
-    /** @type {{matches: (message: any) => boolean, resolve: (message: any) => void, reject: (error: Error) => void, timer: number}[]} */
-    this.questions = [];
+    this.questions = new Questions();
   }
 
   /** @param {{takeover?: boolean}} [how] */
@@ -56,7 +54,7 @@ export class PublishLink {
     const socket = this.socket;
     this.socket = null;
     socket?.close();
-    this.fail("publishing has been stopped");
+    this.questions.fail("publishing has been stopped");
     this.#become("off", "");
   }
 
@@ -82,30 +80,20 @@ export class PublishLink {
       } catch {
         return;
       }
-      if (message.type === "error") {
-        last = message;
-        // A server that does not know binary frames says so at the first; JSON serves as well.
-        if (message.code === "binary_message") this.takesBinary = false;
-      }
+      if (message.type === "error") last = message;
       if (message.type === "ready") {
         this.backoff.reset();
         this.wasReadyAt = performance.now();
         this.#become("ready", "");
       }
-      const at = this.questions.findIndex((question) => question.matches(message));
-      if (at >= 0) {
-        const [question] = this.questions.splice(at, 1);
-        clearTimeout(question.timer);
-        if (message.type === "error") question.reject(Object.assign(new Error(message.message), { code: message.code }));
-        else question.resolve(message);
-      }
+      this.questions.heard(message);
       this.listener.message?.(message);
     };
     socket.onclose = () => {
       clearTimeout(tooLate);
       if (this.socket !== socket) return;
       this.socket = null;
-      this.fail(last.message || "the connection was lost");
+      this.questions.fail(last.message || "the connection was lost");
       if (this.state === "ready") this.wasReadyAt = performance.now();
       this.#ended(last);
     };
@@ -164,26 +152,7 @@ export class PublishLink {
    * @returns {Promise<any>} rejects with an Error of one sentence; `code` is the server's where it refused
    */
   ask(message, matches, patience = 4000) {
-    return new Promise((resolve, reject) => {
-      if (!this.send(message)) {
-        reject(new Error("not connected to the room yet"));
-        return;
-      }
-      const question = { matches, resolve, reject, timer: 0 };
-      question.timer = window.setTimeout(() => {
-        this.questions = this.questions.filter((other) => other !== question);
-        reject(new Error("the server did not answer in time"));
-      }, patience);
-      this.questions.push(question);
-    });
-  }
-
-  /** @param {string} why */
-  fail(why) {
-    for (const question of this.questions.splice(0)) {
-      clearTimeout(question.timer);
-      question.reject(new Error(why));
-    }
+    return this.questions.ask(() => this.send(message), matches, patience);
   }
 
   /** @param {PublishState} state @param {string} detail */

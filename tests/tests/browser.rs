@@ -68,6 +68,7 @@ fn main() -> ExitCode {
         trial("webgpu_draws_what_the_native_client_draws", can_draw, || compare("webgpu")),
         trial("the_page_does_what_it_says", lack.is_none(), the_page_does_what_it_says),
         trial("the_page_survives_the_server", lack.is_none(), the_page_survives_the_server),
+        trial("sources_are_listed_and_told_from_the_page", lack.is_none(), sources_are_listed_and_told_from_the_page),
         trial("a_face_before_the_camera_moves_another_pages_picture", can_track, || with_film("camera.mjs")),
         trial("the_camera_page_fits_a_performer", can_track, || with_film("wizard.mjs")),
     ];
@@ -262,6 +263,19 @@ fn the_page_does_what_it_says() -> Result<()> {
 fn with_film(name: &str) -> Result<()> {
     let server = Server::start();
     script(name, Some(&server), &[("RHYTID_CLIP", &film())])
+}
+
+fn sources_are_listed_and_told_from_the_page() -> Result<()> {
+    let program = rhytid_tests::program("rhytid-server")?;
+    let work = tempfile::tempdir()?;
+    let server = Server::with(|config| {
+        config.listen_udp = vec!["livelink=127.0.0.1:0,room=stage,slot=phone,priority=60".parse().expect("a port for trackers")];
+        config.profiles = Some(work.path().join("profiles"));
+    });
+    let (_, body) = server.get("/api/trackers", "");
+    let trackers: serde_json::Value = serde_json::from_slice(&body)?;
+    let port = trackers["ports"][0]["address"].as_str().context("the port is listed")?;
+    script("sources.mjs", Some(&server), &[("RHYTID_SERVER", &program), ("RHYTID_UDP", Path::new(port)), ("RHYTID_WORK", work.path())])
 }
 
 fn the_page_survives_the_server() -> Result<()> {
