@@ -53,6 +53,8 @@ let room = roomOfAddress();
 /** The character of the last hello. @type {any} */
 let character = null;
 let problem = "";
+/** Why the face is not drawn for the moment. */
+let redrawing = "";
 let view = "beauty";
 let poseShown = -1;
 let wrinklesBefore = "own";
@@ -144,17 +146,18 @@ function openLink() {
 
 /** The view socket's hello: on to its character. @param {string} text */
 async function greeted(text) {
-  if (!viewer) return;
+  const current = viewer;
+  if (!current) return;
   try {
     const hello = JSON.parse(text);
-    viewer.hello(text);
+    current.hello(text);
     const isOther = hello.character.sha256 !== character?.sha256;
     character = hello.character;
-    if (hello.character.sha256 !== viewer.loadedHash) {
+    if (hello.character.sha256 !== current.loadedHash) {
       const glb = await fetchCharacter(hello.character);
-      // Another hello may have come meanwhile.
-      if (character.sha256 !== hello.character.sha256) return;
-      viewer.load(glb, hello.character.sha256);
+      // Another hello may have come meanwhile, or another viewer.
+      if (character.sha256 !== hello.character.sha256 || current !== viewer) return;
+      current.load(glb, hello.character.sha256);
       puppet.setExpressions(expressionNames(glb));
     }
     if (isOther) {
@@ -162,7 +165,7 @@ async function greeted(text) {
       inspector.setCharacter(character);
       poseShown = -1;
     }
-    view = viewer.view;
+    view = current.view;
     showViews();
     markView();
     problem = "";
@@ -172,14 +175,49 @@ async function greeted(text) {
   showState();
 }
 
-/** The graphics device is gone: a fresh page gets another. Once a minute, or a broken driver would keep it reloading. */
-function drawingFailed(/** @type {unknown} */ error) {
-  problem = `${sentence(error).replace(/\.$/, "")}. Load the page again to try once more.`;
+/** Times at which the graphics device was lost lately, milliseconds. @type {number[]} */
+let losses = [];
+/** Losses within a minute after which a person must ask for more: a broken driver would be asked for ever. */
+const MOST_LOSSES = 4;
+
+/** The graphics device is gone: another is asked for, on a fresh canvas, since the old one stays with the old device. @param {unknown} error */
+function drawingFailed(error) {
+  const now = performance.now();
+  losses = [...losses.filter((at) => now - at < 60_000), now];
+  const words = sentence(error).replace(/\.$/, "");
+  if (losses.length > MOST_LOSSES) {
+    problem = `${words}. Load the page again to try once more.`;
+    showState();
+    return;
+  }
+  redrawing = `${words}. Drawing begins again.`;
   showState();
-  const last = Number(sessionStorage.getItem("rhytid.reloaded") ?? 0);
-  if (Date.now() - last < 60_000) return;
-  sessionStorage.setItem("rhytid.reloaded", String(Date.now()));
-  setTimeout(() => location.reload(), 1500);
+  // A driver that has just been reset needs a moment, each time a longer one.
+  setTimeout(drawAgain, 400 * 2 ** losses.length);
+}
+
+async function drawAgain() {
+  const old = byId("face");
+  const fresh = /** @type {HTMLCanvasElement} */ (old.cloneNode());
+  const hadFocus = document.activeElement === old;
+  old.replaceWith(fresh);
+  if (hadFocus) fresh.focus();
+  const before = viewer;
+  viewer = null;
+  before?.close();
+  link?.close();
+  try {
+    await openViewer(fresh, before);
+  } catch (error) {
+    drawingFailed(error);
+    return;
+  }
+  redrawing = "";
+  // Another room may have been entered meanwhile.
+  link?.close();
+  // The room says hello again: the face as it is, whole.
+  openLink();
+  showState();
 }
 
 /** Most characters of a complaint that are shown. */
@@ -203,6 +241,7 @@ const WORDS = {
   idle: ["idle", "Sender gone", "Waiting for somebody to publish to this room."],
   gone: ["bad", "Reconnecting", ""],
   refused: ["bad", "Refused", ""],
+  redrawing: ["warn", "Drawing again", ""],
   unusable: ["bad", "Cannot show the face", ""],
 };
 let shownState = "";
@@ -211,6 +250,7 @@ function showState() {
   let kind = "connecting";
   let detail = "";
   if (problem) [kind, detail] = ["unusable", problem];
+  else if (redrawing) [kind, detail] = ["redrawing", redrawing];
   else if (linkState === "refused") [kind, detail] = ["refused", linkDetail];
   else if (linkState === "lost" || (linkState === "connecting" && (link?.backoff.attempts ?? 0) > 0)) {
     [kind, detail] = ["gone", linkDetail || "The server does not answer"];
@@ -389,6 +429,26 @@ function listen() {
   listenForCopies();
 }
 
+/**
+ * Draws on a canvas.
+ * @param {HTMLCanvasElement} canvas @param {FaceViewer | null} before the one whose view and switches it has
+ */
+async function openViewer(canvas, before) {
+  const started = await FaceViewer.start(canvas, { backend: parameters.get("backend") ?? "auto", transparent: isTransparent });
+  viewer = started;
+  byId("backend").textContent = `Drawn with ${started.backend()}.`;
+  document.documentElement.dataset.backend = started.backend();
+  for (const name of /** @type {("wrinkles" | "light" | "deform")[]} */ (Object.keys(CHOICES))) setSwitch(name, byId(name).value, false);
+  if (before) started.takeOver(before);
+  showViews();
+  new Stage(canvas, started, (now) => {
+    const frame = inspector.isOpen ? started.frame() : null;
+    if (!frame) return;
+    const { latencyMs, drawMs } = started.stats();
+    inspector.pictureShown(frame, latencyMs + drawMs, now);
+  }, drawingFailed);
+}
+
 async function start() {
   document.body.classList.add("viewer");
   document.body.classList.toggle("bare", isBare);
@@ -399,29 +459,18 @@ async function start() {
   document.title = `${room} · Rhytid`;
   picker.current = room;
   puppet.room = room;
-  const canvas = byId("face");
+  for (const name of /** @type {("wrinkles" | "light" | "deform")[]} */ (Object.keys(CHOICES))) {
+    const known = CHOICES[name].map(([value]) => value);
+    // What the address says is for this page alone.
+    byId(name).value = [parameters.get(name), storage.read(name)].find((value) => known.includes(value)) ?? known[0];
+  }
   try {
-    viewer = await FaceViewer.start(canvas, { backend: parameters.get("backend") ?? "auto", transparent: isTransparent });
+    await openViewer(byId("face"), null);
   } catch (error) {
     problem = sentence(error);
     showState();
     return;
   }
-  const started = viewer;
-  byId("backend").textContent = `Drawn with ${started.backend()}.`;
-  document.documentElement.dataset.backend = started.backend();
-  for (const name of /** @type {("wrinkles" | "light" | "deform")[]} */ (Object.keys(CHOICES))) {
-    const asked = parameters.get(name);
-    // What the address says is for this page alone.
-    setSwitch(name, asked ?? storage.read(name) ?? CHOICES[name][0][0], !asked);
-  }
-  showViews();
-  new Stage(canvas, started, (now) => {
-    const frame = inspector.isOpen ? started.frame() : null;
-    if (!frame) return;
-    const { latencyMs, drawMs } = started.stats();
-    inspector.pictureShown(frame, latencyMs + drawMs, now);
-  }, drawingFailed);
   chooseView(parameters.get("view") ?? "beauty");
   setInterval(showNumbers, NUMBERS);
   openLink();

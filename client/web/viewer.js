@@ -40,8 +40,28 @@ export class FaceViewer {
     return new FaceViewer(await module.Viewer.start(canvas, { backend, transparent }));
   }
 
+  /** Takes over view and switches of another one. @param {FaceViewer} other */
+  takeOver(other) {
+    this.view = other.view;
+    for (const [name, value] of other.switches) this.setSwitch(name, value);
+  }
+
   backend() {
     return this.client.backend();
+  }
+
+  /** Why nothing can be drawn any more; undefined while all is well. @returns {string | undefined} */
+  failure() {
+    return this.client.failure();
+  }
+
+  /** Gives everything back. */
+  close() {
+    try {
+      this.client.free();
+    } catch {
+      // A device that is gone may refuse even that.
+    }
   }
 
   /** Takes a view socket's first message. @param {string} text */

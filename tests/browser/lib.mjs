@@ -24,6 +24,12 @@ const FLAGS = [
   "--enable-unsafe-swiftshader",
 ];
 
+/** WebGPU without a GPU. A canvas of it reaches the page only where the browser itself draws with the same software Vulkan. */
+export const WEBGPU = [
+  "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader",
+  "--use-angle=vulkan",
+];
+
 /** A browser without a window. */
 export function launch(...flags) {
   const { chromium } = required("playwright-core");

@@ -66,11 +66,15 @@ fn main() -> ExitCode {
         trial("qr_codes_can_be_read", has("node") && has_package("jsqr"), || script("qr.mjs", None, &[])),
         trial("webgl2_draws_what_the_native_client_draws", can_draw, || compare("webgl")),
         trial("webgpu_draws_what_the_native_client_draws", can_draw, || compare("webgpu")),
-        trial("the_page_does_what_it_says", lack.is_none(), the_page_does_what_it_says),
+        trial("the_page_does_what_it_says", lack.is_none(), || on_a_server("page.mjs")),
         trial("the_page_survives_the_server", lack.is_none(), the_page_survives_the_server),
+        trial("a_lost_graphics_device_is_replaced", lack.is_none(), || on_a_server("lost.mjs")),
+        trial("publish_to_shown_picture_takes_so_long_with_webgl2", lack.is_none(), || latency("webgl")),
+        trial("publish_to_shown_picture_takes_so_long_with_webgpu", lack.is_none(), || latency("webgpu")),
         trial("sources_are_listed_and_told_from_the_page", lack.is_none(), sources_are_listed_and_told_from_the_page),
         trial("a_face_before_the_camera_moves_another_pages_picture", can_track, || with_film("camera.mjs")),
         trial("the_camera_page_fits_a_performer", can_track, || with_film("wizard.mjs")),
+        trial("the_camera_page_and_the_server_agree", can_track, || with_film("fit.mjs")),
     ];
     libtest_mimic::run(&arguments, trials).exit_code()
 }
@@ -254,9 +258,14 @@ impl Difference {
     }
 }
 
-fn the_page_does_what_it_says() -> Result<()> {
+fn on_a_server(name: &str) -> Result<()> {
     let server = Server::start();
-    script("page.mjs", Some(&server), &[])
+    script(name, Some(&server), &[])
+}
+
+fn latency(backend: &str) -> Result<()> {
+    let server = Server::start();
+    script("latency.mjs", Some(&server), &[("RHYTID_BACKEND", Path::new(backend))])
 }
 
 /// Runs a script that shows the film to the browser's camera.
