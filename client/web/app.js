@@ -131,7 +131,9 @@ function openLink() {
     hello: (text) => greeted(text),
     packet: (bytes) => {
       const now = performance.now();
-      viewer?.packet(bytes, now);
+      if (viewer) viewer.packet(bytes, now);
+      // A delta needs the key before it and nothing between.
+      else early = (bytes[0] ?? 0) & 1 ? [...early.slice(0, 1), bytes] : [bytes];
       const read = times.read(bytes);
       if (read) inspector.packetArrived(read.micros, wallClock());
     },
@@ -144,17 +146,29 @@ function openLink() {
   });
 }
 
+/** Packets that came before there was a viewer: the last key and the newest one after it. @type {Uint8Array[]} */
+let early = [];
+/** The last hello, until there is a viewer to take it. */
+let earlyHello = "";
+
 /** The view socket's hello: on to its character. @param {string} text */
 async function greeted(text) {
   const current = viewer;
-  if (!current) return;
+  if (!current) {
+    earlyHello = text;
+    early = [];
+    fetched(JSON.parse(text).character);
+    return;
+  }
   try {
     const hello = JSON.parse(text);
     current.hello(text);
+    for (const bytes of early.splice(0)) current.packet(bytes, performance.now());
     const isOther = hello.character.sha256 !== character?.sha256;
     character = hello.character;
     if (hello.character.sha256 !== current.loadedHash) {
-      const glb = await fetchCharacter(hello.character);
+      const glb = await fetched(hello.character);
+      performance.mark("rhytid:fetched");
       // Another hello may have come meanwhile, or another viewer.
       if (character.sha256 !== hello.character.sha256 || current !== viewer) return;
       current.load(glb, hello.character.sha256);
@@ -173,6 +187,23 @@ async function greeted(text) {
     problem = sentence(error);
   }
   showState();
+}
+
+/** A character that is being fetched, perhaps while the viewer is still being loaded. @type {{sha256: string, glb: Promise<Uint8Array>} | null} */
+let fetching = null;
+
+/** @param {{url: string, sha256: string}} wanted @returns {Promise<Uint8Array>} */
+function fetched(wanted) {
+  if (fetching?.sha256 !== wanted.sha256) {
+    const glb = fetchCharacter(wanted);
+    // Whoever awaits it hears of its failure; it is tried anew then.
+    glb.catch(() => { fetching = null; });
+    fetching = { sha256: wanted.sha256, glb };
+  }
+  const { glb } = fetching;
+  // Taken once: 6 MB are not kept for nothing.
+  if (viewer) fetching = null;
+  return glb;
 }
 
 /** Times at which the graphics device was lost lately, milliseconds. @type {number[]} */
@@ -255,7 +286,7 @@ function showState() {
   else if (linkState === "lost" || (linkState === "connecting" && (link?.backoff.attempts ?? 0) > 0)) {
     [kind, detail] = ["gone", linkDetail || "The server does not answer"];
   } else if (linkState === "open") {
-    const state = viewer?.stats().state ?? "waiting";
+    const state = viewer ? viewer.stats().state : "connecting";
     kind = state in WORDS ? state : "waiting";
   }
   const [color, headline, text] = WORDS[/** @type {keyof typeof WORDS} */ (kind)];
@@ -464,6 +495,8 @@ async function start() {
     // What the address says is for this page alone.
     byId(name).value = [parameters.get(name), storage.read(name)].find((value) => known.includes(value)) ?? known[0];
   }
+  // Hello and character come while the viewer is loaded.
+  openLink();
   try {
     await openViewer(byId("face"), null);
   } catch (error) {
@@ -473,7 +506,7 @@ async function start() {
   }
   chooseView(parameters.get("view") ?? "beauty");
   setInterval(showNumbers, NUMBERS);
-  openLink();
+  if (earlyHello) greeted(earlyHello);
   if (!isBare && storage.read("panel") !== false && innerWidth > 1100) panel.toggle(true);
 }
 

@@ -67,7 +67,7 @@ export class Wizard {
     const wrong = element("p", { id: "wizard-wrong", class: "note", role: "alert" });
     byId("wizard-text").replaceChildren(
       element("p", {}, "Eight faces, twenty seconds. Make each as strongly as you can and hold it until the bar is full."),
-      ...(whom ? [element("p", { class: "quiet" }, `Whoever is before ${whom} must see this page.`)] : []),
+      ...(whom ? [element("p", { class: "quiet" }, `The person in front of ${whom} must see this page.`)] : []),
       element("p", { class: "wizard-field" }, element("label", { for: "wizard-name" }, "The profile’s name"), name), wrong);
     const start = () => {
       const text = name.value.trim();

@@ -89,7 +89,7 @@ await run(async () => {
   // The guided fit of the headset, whose wearer goes half as far as the character.
   await page.keyboard.press("Enter");
   check("Enter opens the fit", (await text(page, "#wizard-title")) === "Fit the performer");
-  check("it says who must see the page", (await text(page, "#wizard-text")).includes("before headset must see this page"));
+  check("it says who must see the page", (await text(page, "#wizard-text")).includes("in front of headset must see this page"));
   await page.fill("#wizard-name", "no name");
   await page.click("#wizard-buttons >> text=Start");
   check("a name that cannot be one is refused in words", (await text(page, "#wizard-wrong")).includes("letters, digits"));
