@@ -303,8 +303,7 @@ fn sources_are_listed_and_told_from_the_page() -> Result<()> {
 
 fn a_newcomers_way() -> Result<()> {
     let program = rhytid_tests::program("rhytid-server")?;
-    let server =
-        Server::with(|config| config.listen_udp = vec!["openseeface=127.0.0.1:0,room=demo".parse().expect("a port for trackers")]);
+    let server = Server::with(|config| config.listen_udp = vec!["openseeface=127.0.0.1:0,room=demo".parse().expect("a port for trackers")]);
     let port = tracker_port(&server)?;
     let feed = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/assets/demo.ibug68.jsonl");
     script(
