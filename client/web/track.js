@@ -17,6 +17,8 @@ const NUM_POINTS = 478;
 const NOBODY = 100;
 /** Milliseconds between two looks at the video while the page is out of sight. */
 const HIDDEN = 30;
+/** Milliseconds without a presented picture after which the page is taken to be out of sight: in a frame that is not shown it is not told. */
+const UNSEEN = 150;
 
 const isEmbedded = new URLSearchParams(location.search).get("embedded") === "1" && parent !== window;
 /** @type {HTMLVideoElement} */
@@ -201,13 +203,15 @@ async function loop(mine) {
  */
 function nextPicture() {
   return new Promise((resolve) => {
+    const asked = performance.now();
     const request = video.requestVideoFrameCallback((now, { captureTime }) => {
       tick = () => {};
+      lastVideoTime = video.currentTime;
       resolve(Math.min(now, captureTime ?? now));
     });
     // Out of sight no picture is presented, but the video goes on.
     tick = () => {
-      if (!document.hidden || video.currentTime === lastVideoTime) return;
+      if ((!document.hidden && performance.now() - asked < UNSEEN) || video.currentTime === lastVideoTime) return;
       // Where tracking is slow, the page's other work needs its share.
       if (performance.now() - tracked.at < 0.3 * tracked.took) return;
       tick = () => {};

@@ -37,17 +37,24 @@ await run(async () => {
   if (shots) await page.waitForTimeout(6000);
   await shoot(page, "browser.jpg");
 
+  const listing = async () => {
+    const { rooms } = await (await page.request.get(new URL("/api/rooms", page.url()).href)).json();
+    return rooms.find(({ name }) => name === "demo");
+  };
   await page.click("#tab-share");
+  const frame = async () => (await listing()).frame;
+  const hidden = await frame();
+  await until("frames of a camera whose tab is not shown", async () => {
+    const { session, seq } = await frame();
+    return session === hidden.session && seq > hidden.seq + 5;
+  });
+  check("the camera goes on while another tab is shown", true);
   const address = await page.locator("#share-view").inputValue();
   const second = await launch();
   const other = await open(second, `${address}&bare=1`, { size: { width: 320, height: 320 } });
   await faceIsThere(other.page);
   await live(other.page);
   await moves(other.page);
-  const listing = async () => {
-    const { rooms } = await (await page.request.get(new URL("/api/rooms", page.url()).href)).json();
-    return rooms.find(({ name }) => name === "demo");
-  };
   check("the link in a second browser shows the same room's face, moving", (await listing()).viewers === 2);
 
   await page.click("#tab-sources");
@@ -79,7 +86,7 @@ await run(async () => {
     await page.setViewportSize(size);
   }
   fake.kill("SIGTERM");
-  await until("the webcam driving again", async () => (await drives()) === "webcam");
+  await until("the webcam driving again", async () => (await drives()).includes("webcam"));
   check("where it falls silent, the webcam drives again", true);
   check("the console says nothing of errors", errors.length === 0, errors.join("; "));
   await first.close();
