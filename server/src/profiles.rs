@@ -93,7 +93,7 @@ impl Profiles {
     /// The newest profile that was made with this source.
     pub fn of_source(&self, source: &str) -> Option<Arc<Profile>> {
         let by_name = self.lock();
-        let of_it = by_name.values().filter(|kept| !source.is_empty() && kept.profile.source == source);
+        let of_it = by_name.values().filter(|kept| !source.is_empty() && without_address(&kept.profile.source) == without_address(source));
         of_it.max_by_key(|kept| kept.modified).map(|kept| kept.profile.clone())
     }
 
@@ -124,6 +124,12 @@ impl Profiles {
         };
         self.lock().values().map(listing).collect()
     }
+}
+
+/// What a tracker is called, without the address it sends from, which a phone gets anew every day.
+fn without_address(source: &str) -> &str {
+    let address = source.strip_suffix(')').and_then(|source| source.rsplit_once(" ("));
+    address.filter(|(_, address)| address.parse::<std::net::IpAddr>().is_ok()).map_or(source, |(name, _)| name)
 }
 
 /// Reads a profile's file, which gives it its name. The error says what is wrong.
@@ -162,6 +168,8 @@ mod tests {
         let again = Profiles::load(Some(&folder.path().join("made"))).unwrap();
         assert_eq!(again.list().iter().map(|listed| listed.name.as_str()).collect::<Vec<_>>(), ["ada", "ben"]);
         assert_eq!(again.of_source("ada's phone").unwrap().ranges.smile, 1.25);
+        assert_eq!(again.of_source("ada's phone (192.0.2.7)").unwrap().name, "ada", "at another address");
+        assert!(again.of_source("ada's phone (old)").is_none());
         assert!(again.of_source("").is_none() && again.of_source("other").is_none());
         assert_eq!(again.named(&RoomName::new("ben").unwrap()).unwrap().ranges.smile, 2.0);
     }

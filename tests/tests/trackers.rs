@@ -14,7 +14,8 @@ use rhytid_shared::trust::Trust;
 use rhytid_shared::{ArkitShape, NUM_ARKIT_SHAPES};
 use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
-use std::sync::mpsc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, mpsc};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
@@ -454,6 +455,106 @@ fn a_rooms_face_goes_out_as_vmc() {
     assert!(face.head_rotation.unwrap().abs_diff_eq(expected, 0.01), "{:?}", face.head_rotation);
     sender.join().unwrap();
     assert!(server.metric("rhytid_vmc_frames_out_total") > 20.0);
+}
+
+/// Sends frames of a webcam, jaw open and brows down, until it is dropped.
+struct Webcam {
+    is_over: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Webcam {
+    fn start(server: &Server) -> Self {
+        let mut publisher = server.publisher("demo");
+        publisher.send(r#"{"type":"hello","version":1,"source":"webcam","slot":"webcam"}"#);
+        assert!(publisher.text().contains("ready"));
+        let is_over = Arc::new(AtomicBool::new(false));
+        let thread = std::thread::spawn({
+            let is_over = is_over.clone();
+            move || {
+                let start = Instant::now();
+                while !is_over.load(Ordering::Relaxed) {
+                    let t = start.elapsed().as_secs_f64();
+                    publisher
+                        .send(&format!(r#"{{"type":"frame","t":{t},"weights":{{"jawOpen":0.8,"browDownLeft":0.5,"browDownRight":0.5}}}}"#));
+                    std::thread::sleep(Duration::from_millis(25));
+                }
+            }
+        });
+        Self { is_over, thread: Some(thread) }
+    }
+}
+
+impl Drop for Webcam {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
+        self.thread.take().map(JoinHandle::join);
+    }
+}
+
+fn wait_for_weights(viewer: &mut Viewer, wanted: &[(&str, std::ops::Range<f32>)]) {
+    let start = Instant::now();
+    while start.elapsed() < Duration::from_secs(10) {
+        assert!(viewer.next_packet());
+        let weights = viewer.frame.shapes.unwrap();
+        if wanted.iter().all(|(name, range)| range.contains(&weights[index(name)])) {
+            return;
+        }
+    }
+    let seen: Vec<_> = wanted.iter().map(|(name, _)| (name, viewer.frame.shapes.unwrap()[index(name)])).collect();
+    panic!("{seen:?}, expected {wanted:?}");
+}
+
+#[test]
+fn a_phones_datagrams_and_a_webcams_socket_share_a_face_by_the_rule() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("brows.jsonl");
+    let mut text = String::from("{\"type\":\"hello\",\"version\":1,\"source\":\"test\"}\n");
+    for i in 0..1200 {
+        text += &format!("{{\"type\":\"frame\",\"t\":{},\"weights\":{{\"browInnerUp\":0.9}}}}\n", f64::from(i) / 60.0);
+    }
+    std::fs::write(&path, text).unwrap();
+    let server = listening(&["livelink=127.0.0.1:0,room=demo,slot=phone,priority=60,groups=brows"]);
+    let mut viewer = server.viewer("demo");
+    let webcam = Webcam::start(&server);
+    wait_for_weights(&mut viewer, &[("browDownLeft", 0.45..0.55), ("jawOpen", 0.75..0.85)]);
+    let phone = Fake::start(FakeKind::LiveLink, path.clone(), Some(port(&server, 0)));
+    wait_for_weights(&mut viewer, &[("browInnerUp", 0.85..0.95), ("browDownLeft", 0.0..0.01), ("jawOpen", 0.75..0.85)]);
+    let sources = server.room("demo").unwrap()["sources"].clone();
+    let drives = |slot: &str| sources.as_array().unwrap().iter().find(|source| source["slot"] == slot).unwrap()["drives"].clone();
+    assert_eq!(drives("phone"), serde_json::json!(["brows"]));
+    assert_eq!(drives("webcam"), serde_json::json!(["lids", "gaze", "mouth", "head"]));
+    // It cannot speak for itself: somebody else does.
+    let mut control = server.connect("/v1/rooms/demo/control?slot=phone", &[]).unwrap();
+    control.send(r#"{"type":"settings","gains":{"brows":0.5}}"#);
+    assert!(control.text().contains(r#""brows":0.5"#));
+    wait_for_weights(&mut viewer, &[("browInnerUp", 0.4..0.5), ("jawOpen", 0.75..0.85)]);
+    // The phone stops: brows from the webcam. It stops, too: brows from the phone alone.
+    drop(phone);
+    wait_for_weights(&mut viewer, &[("browInnerUp", 0.0..0.01), ("browDownLeft", 0.45..0.55), ("jawOpen", 0.75..0.85)]);
+    drop(webcam);
+    let _phone = Fake::start(FakeKind::LiveLink, path, Some(port(&server, 0)));
+    wait_for_weights(&mut viewer, &[("browInnerUp", 0.4..0.95), ("browDownLeft", 0.0..0.01)]);
+}
+
+#[test]
+fn of_two_at_the_same_priority_the_later_takes_over() {
+    let server = listening(&["openseeface=127.0.0.1:0,room=demo"]);
+    let mut viewer = server.viewer("demo");
+    let _webcam = Webcam::start(&server);
+    wait_for_weights(&mut viewer, &[("jawOpen", 0.75..0.85)]);
+    let fake = Fake::start(FakeKind::OpenSeeFace, landmarks_feed(), Some(port(&server, 0)));
+    let all = serde_json::json!(["brows", "lids", "gaze", "mouth", "head"]);
+    let drives = |slot: &'static str| {
+        let all = all.clone();
+        move |room: Option<&serde_json::Value>| {
+            let sources = room.and_then(|room| room["sources"].as_array().cloned()).unwrap_or_default();
+            sources.iter().any(|source| source["slot"] == slot && source["drives"] == all)
+        }
+    };
+    server.wait_for_room("demo", drives("openseeface"));
+    drop(fake);
+    server.wait_for_room("demo", drives("webcam"));
 }
 
 #[test]
