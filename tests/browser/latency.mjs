@@ -39,21 +39,25 @@ await run(async () => {
     const { FaceViewer } = await import("/viewer.js");
     const draw = FaceViewer.prototype.draw;
     window.samples = [];
+    let before = 1;
     FaceViewer.prototype.draw = function measured(now) {
       const isDrawn = draw.call(this, now);
       const shown = isDrawn ? this.frame()?.shapes[jaw] : undefined;
       requestAnimationFrame(() => {
         const wall = performance.timeOrigin + performance.now();
-        // Near its ends the ramp says too little, and where it shuts a picture would be read as another time.
-        if (shown === undefined || shown < 0.1 || shown > 0.9) return;
-        const told = Math.floor(wall / (2 * ramp)) * 2 * ramp + shown * ramp;
+        if (shown === undefined) return;
+        // Only where the jaw opens, and far enough from its turns that pictures far apart cannot be mistaken for it.
+        const isOpening = shown > before && shown > 0.1 && shown < 0.7;
+        before = shown;
+        if (!isOpening) return;
+        const told = Math.floor((wall - shown * ramp) / (2 * ramp)) * 2 * ramp + shown * ramp;
         const { latencyMs, fps } = this.stats();
-        window.samples.push({ delay: wall - told, phase: wall % (2 * ramp), playout: latencyMs, fps });
+        window.samples.push({ delay: wall - told, playout: latencyMs, fps });
       });
       return isDrawn;
     };
   }, [RAMP, 17]);
-  const samples = async () => (await page.evaluate(() => window.samples)).filter(({ phase }) => phase < RAMP);
+  const samples = () => page.evaluate(() => window.samples);
   await page.waitForTimeout(3000);
   await page.evaluate(() => { window.samples = []; });
   const end = Date.now() + LONGEST;
