@@ -13,6 +13,7 @@ mod fullscreen;
 #[cfg(not(target_arch = "wasm32"))]
 mod headless;
 mod layouts;
+mod map_pool;
 mod picture_texture;
 mod pipelines;
 mod present;
@@ -37,6 +38,7 @@ pub use device::{optional_features, required_limits};
 pub use frame::RenderFrame;
 #[cfg(not(target_arch = "wasm32"))]
 pub use headless::{AdapterChoice, Headless, RenderError};
+pub use map_pool::MapPool;
 #[cfg(not(target_arch = "wasm32"))]
 pub use picture_texture::picture_texture;
 pub use pipelines::VERTEX_LAYOUT;
@@ -51,6 +53,7 @@ use anatomy::{Mouth, eyeballs, gazes};
 use blood::Blood;
 use glam::{Affine3A, Vec3};
 use layouts::Layouts;
+use map_pool::PooledMap;
 use pipelines::{Key, Look, Pipelines, Wire};
 use present::Presenter;
 use rhytid_shared::Character;
@@ -171,7 +174,15 @@ pub struct Renderer {
     /// Draw calls of the last picture.
     num_draws: u32,
     static_bytes: u64,
+    /// What the bind groups read from: kept in the pool for as long as this character is drawn.
+    maps: Vec<Arc<PooledMap>>,
     target_format: wgpu::TextureFormat,
+}
+
+/// Maps of a character that is drawn no longer.
+#[derive(Debug)]
+pub struct KeptMaps {
+    _maps: Vec<Arc<PooledMap>>,
 }
 
 /// Metres from one furrow of the forehead to the next: where they cover less than a few pixels, wrinkles fade.
@@ -189,10 +200,17 @@ struct Bounds {
 
 impl Renderer {
     /// Uploads `asset` for pictures of `target_format` (any 8-bit RGBA or BGRA format,
-    /// with or without sRGB encoding). Pipelines are built as views first need them.
-    pub fn new(device: &wgpu::Device, queue: &wgpu::Queue, asset: &CharacterAsset, target_format: wgpu::TextureFormat) -> Self {
+    /// with or without sRGB encoding); maps that a character of the device's `pool` has are shared with it.
+    /// Pipelines are built as views first need them.
+    pub fn new(
+        device: &wgpu::Device,
+        queue: &wgpu::Queue,
+        pool: &MapPool,
+        asset: &CharacterAsset,
+        target_format: wgpu::TextureFormat,
+    ) -> Self {
         let layouts = Layouts::new(device);
-        let mut uploader = Uploader { device, queue, bytes: 0 };
+        let mut uploader = Uploader::new(device, queue, pool);
         let primitives: Vec<Primitive> = asset.primitives.iter().map(|primitive| uploader.primitive(&layouts, asset, primitive)).collect();
         let group = uploader.character(&layouts, asset);
         let frame_block = uploader.uniform("frame", size_of::<uniforms::Frame>());
@@ -226,6 +244,7 @@ impl Renderer {
             pipelines: Pipelines::new(&layouts, asset.character.num_poses()),
             background: background::pipeline(device),
             static_bytes: uploader.bytes + shadow.bytes,
+            maps: uploader.maps,
             shadow,
             environment,
             lit_by: None,
@@ -305,9 +324,19 @@ impl Renderer {
         self.num_draws
     }
 
-    /// Bytes of buffers and textures this renderer holds on the device.
+    /// Bytes of buffers and textures this renderer uses on the device, shared ones included.
     pub fn gpu_bytes(&self) -> u64 {
         self.static_bytes + self.targets.as_ref().map_or(0, |targets| targets.bytes)
+    }
+
+    /// Of those, bytes of maps that another character on the device uses as well.
+    pub fn shared_bytes(&self) -> u64 {
+        self.maps.iter().filter(|map| Arc::strong_count(map) > 1).map(|map| map.bytes).sum()
+    }
+
+    /// Drops all but the maps, which are kept until the value is dropped: for the next character, which may have the same.
+    pub fn into_maps(self) -> KeptMaps {
+        KeptMaps { _maps: self.maps }
     }
 
     fn write_uniforms(&mut self, queue: &wgpu::Queue, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) {
