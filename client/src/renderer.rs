@@ -49,7 +49,7 @@ pub use timing::{Pass, PassTimer};
 pub use view::{BlendError, BlendMode, NameError, Term, ViewError, ViewMode, WrinkleSystem, ZoneBlend};
 
 use crate::asset::{CharacterAsset, Palette, Surface};
-use anatomy::{Mouth, eyeballs, gazes};
+use anatomy::{Lids, Mouth, eyeballs, gazes};
 use blood::Blood;
 use glam::{Affine3A, Vec3};
 use layouts::Layouts;
@@ -57,6 +57,7 @@ use map_pool::PooledMap;
 use pipelines::{Key, Look, Pipelines, Wire};
 use present::Presenter;
 use rhytid_shared::Character;
+use rhytid_shared::character::Side;
 use scattering::{Lens, Scattering};
 use shadow::Shadow;
 use std::sync::Arc;
@@ -447,6 +448,7 @@ impl Renderer {
         )
         .inverse();
         let mouth = Mouth::new(character, frame);
+        let lids = [Side::Left, Side::Right].map(|side| Lids::new(character, frame, side));
         let shown = |k: usize| match settings.view {
             ViewMode::Influence(None) | ViewMode::Masks(None) => 1.0,
             ViewMode::Influence(Some(only)) | ViewMode::Masks(Some(only)) if only == k => 1.0,
@@ -466,6 +468,8 @@ impl Renderer {
             mouth: mouth.middle.extend(mouth.half_width).to_array(),
             mouth_shape: [mouth.light_reach(), mouth.corner_depth, 0.0, 0.0],
             eyeballs: eyeballs(character),
+            lid_corners: [lids[0].corners, lids[1].corners],
+            lid_arches: [lids[0].upper, lids[0].lower, lids[1].upper, lids[1].lower],
             gazes: gazes(character, frame),
             skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
             blood: [self.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],
