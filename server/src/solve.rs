@@ -23,6 +23,7 @@ mod landmark_session;
 mod landmarks_to_bones;
 mod lids;
 mod linear;
+mod lips;
 mod lower_face;
 mod points;
 mod rbf;
