@@ -129,7 +129,8 @@ await run(async () => {
   check("a profile from a file is used", true);
   await details.locator("select").selectOption("ada");
   await until("the kept profile", async () => (await seen.frame()).shapes.mouthSmileLeft > 0.9);
-  check("a profile that the server keeps is used", (await details.textContent()).includes("In use: ada"));
+  await until("its name", async () => (await details.textContent()).includes("In use: ada"));
+  check("a profile that the server keeps is used", true);
   const [again] = await Promise.all([page.waitForEvent("download"), details.locator("text=Save as a file").click()]);
   check("it can be saved as a file", again.suggestedFilename() === "ada.json");
 
