@@ -107,9 +107,9 @@ mod tests {
 
     #[test]
     fn mouth_tracked_as_closed_is_closed_however_far_the_jaw_is_down() {
-        for jaw in [0.1, 0.3, 0.6, 1.0] {
+        for jaw in [0.02, 0.05, 0.1, 0.2, 0.3, 0.6, 1.0] {
             let [open, half, closed] = [0.0, 0.5, 1.0].map(|share| gap(&[("jawOpen", jaw), ("mouthClose", share * jaw)]));
-            assert!(closed.abs() < 2.0e-3, "{closed} m are left at a jaw of {jaw}");
+            assert!(closed.abs() < 0.5e-3, "{closed} m are left at a jaw of {jaw}");
             assert!(half > 0.3 * open && half < 0.7 * open, "{half} m of {open} m");
         }
     }

@@ -202,6 +202,9 @@ struct Correctives {
     centres: Vec<f32>,
     /// `-1 / (2 sigma^2)`.
     falloff: f64,
+    /// `jawOpen` and `mouthClose` where no example says what the two do together: then a jaw parts the lips by what it exceeds the
+    /// mouth's closing alone.
+    closing: Option<[usize; 2]>,
     /// Each bell's value at neutral.
     at_neutral: Vec<f64>,
     /// `(bone, m amplitudes)`.
@@ -269,10 +272,16 @@ impl Correctives {
             .iter()
             .map(|centre| libm::exp(centre.iter().map(|&at| f64::from(0.0 - at) * f64::from(0.0 - at)).sum::<f64>() * falloff))
             .collect();
-        Some(Self { shapes, centres: centres.concat(), falloff, at_neutral, amplitudes })
+        let [jaw_open, mouth_close] = ["jawOpen", "mouthClose"].map(|name| ArkitShape::from_name(name).map(ArkitShape::index));
+        let closing = jaw_open.zip(mouth_close.filter(|close| !shapes.contains(close))).map(<[usize; 2]>::from);
+        Some(Self { shapes, centres: centres.concat(), falloff, closing, at_neutral, amplitudes })
     }
 
     fn add(&self, weights: &Weights, motions: &mut [Vec3]) {
+        let mut weights = *weights;
+        if let Some([jaw_open, mouth_close]) = self.closing {
+            weights[jaw_open] = (weights[jaw_open] - weights[mouth_close]).max(0.0);
+        }
         for (m, centre) in self.centres.chunks_exact(self.shapes.len()).enumerate() {
             let mut square = 0.0;
             for (&shape, &at) in self.shapes.iter().zip(centre) {
