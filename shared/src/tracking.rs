@@ -6,6 +6,7 @@ mod profile;
 mod reader;
 mod settings;
 mod slot;
+mod values;
 
 use crate::face::HeadPose;
 use crate::layout::Layout;

@@ -1,7 +1,8 @@
 //! One publish session's messages, checked in their order.
 
 use super::binary;
-use super::fields::{Fields, Kind, LayoutField, cut};
+use super::fields::{Fields, Kind, LayoutField};
+use super::values::cut;
 use super::{
     Command, FIT_SECONDS, FitRequest, FitStep, MessageError, PublishHello, PublishMessage, Settings, Slot, TrackingData, TrackingFrame,
 };
