@@ -60,7 +60,6 @@ fn main() -> ExitCode {
     };
     let can_draw = lack.is_none() && native_picture_is_possible();
     let can_track = lack.is_none() && film().is_file() && target().join("web/face_mesh/face_mesh.js").is_file();
-    // Those ignored draw several pages at once, for minutes where there is no graphics processor: `-- --ignored` runs them.
     let trials = vec![
         trial("the_module_takes_less_than_3_mb", has_bundle(), the_module_takes_less_than_3_mb),
         trial("the_pages_own_code", has("node"), || script("wire.mjs", None, &[])),
@@ -74,11 +73,10 @@ fn main() -> ExitCode {
         trial("a_lost_graphics_device_is_replaced", lack.is_none(), || on_a_server("lost.mjs")),
         trial("publish_to_shown_picture_takes_so_long_with_webgl2", lack.is_none(), || latency("webgl")),
         trial("publish_to_shown_picture_takes_so_long_with_webgpu", lack.is_none(), || latency("webgpu")),
-        trial("sources_are_listed_and_told_from_the_page", lack.is_none(), sources_are_listed_and_told_from_the_page)
-            .with_ignored_flag(true),
+        trial("sources_are_listed_and_told_from_the_page", lack.is_none(), sources_are_listed_and_told_from_the_page),
         trial("a_face_before_the_camera_moves_another_pages_picture", can_track, || with_film("camera.mjs")),
         trial("the_camera_page_fits_a_performer", can_track, || with_film("wizard.mjs")),
-        trial("a_newcomers_way", can_track, a_newcomers_way).with_ignored_flag(true),
+        trial("a_newcomers_way", can_track, a_newcomers_way),
         trial("the_camera_page_and_the_server_agree", can_track, || with_film("fit.mjs")),
     ];
     libtest_mimic::run(&arguments, trials).exit_code()
