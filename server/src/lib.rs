@@ -1,7 +1,7 @@
 //! Takes what trackers see, moves a character's bones with it and streams the solved frames to viewers.
 //!
 //! `solve` and `pipeline` are pure: frames in, packets out. Everything else is the service around them: [`run`] serves,
-//! [`send()`] publishes feed files.
+//! [`send()`] publishes feed files, `load` measures the whole.
 
 #![forbid(unsafe_code)]
 
@@ -9,6 +9,8 @@ mod clip;
 mod config;
 pub mod feed;
 mod http;
+#[cfg(target_os = "linux")]
+pub mod load;
 mod metrics;
 pub mod pipeline;
 mod publish;

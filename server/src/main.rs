@@ -1,4 +1,7 @@
-//! The server's command line: `serve` and `send`.
+//! The server's command line.
+
+#[cfg(target_os = "linux")]
+mod load_command;
 
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
@@ -31,6 +34,13 @@ enum Command {
     Serve(Box<ServeArgs>),
     /// Publish a feed file, or an animation clip of a character.
     Send(SendArgs),
+    /// Measure: a server on one core, its publishers and viewers on another.
+    #[cfg(target_os = "linux")]
+    Load(load_command::LoadArgs),
+    /// What `load --baseline` measures against.
+    #[cfg(target_os = "linux")]
+    #[command(hide = true)]
+    PlainServer,
 }
 
 #[derive(Args)]
@@ -107,6 +117,10 @@ async fn main() -> ExitCode {
     let result = match cli.command {
         Command::Serve(args) => serve(*args, matches.subcommand_matches("serve")).await,
         Command::Send(args) => send_feed(args).await,
+        #[cfg(target_os = "linux")]
+        Command::Load(args) => load_command::load(args).await,
+        #[cfg(target_os = "linux")]
+        Command::PlainServer => load_command::plain_server().await,
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -120,8 +134,8 @@ async fn main() -> ExitCode {
 /// Logs go to standard error; `RUST_LOG` overrules `-v`.
 fn start_log(cli: &Cli) {
     let level = match (cli.verbose, &cli.command) {
-        (0, Command::Send(_)) => "warn",
         (0, Command::Serve(_)) => "rhytid_server=info,warn",
+        (0, _) => "warn",
         (1, _) => "rhytid_server=debug,info",
         _ => "debug",
     };
