@@ -110,8 +110,8 @@ pub struct LoadReport {
     pub cpu_percent: f64,
     /// Microseconds of the server a frame sent.
     pub cpu_micros_a_frame: f64,
-    /// Percent of the server's core that other processes took: noise.
-    pub others_percent: f64,
+    /// Percent of the server's core that other processes took: noise. None where the server has no core of its own.
+    pub others_percent: Option<f64>,
     /// Percent of a core that the generator took; near 100 it measures itself.
     pub generator_percent: f64,
     /// Resident memory of the server before anybody came, bytes.
@@ -146,6 +146,8 @@ struct Feed<'a> {
 pub fn load(options: &LoadOptions, mut each: impl FnMut(&LoadReport)) -> Result<Vec<LoadReport>, LoadError> {
     check(options)?;
     let (hello, lines) = session()?;
+    // Before this thread is kept on one of them.
+    let cores = Cores::choose().filter(|cores| cores.server != cores.generator);
     let is_disturbed = options.stalled > 0.0 || options.reconnecting > 0.0;
     let mut packet_bytes = PACKET_BYTES;
     let mut reports = Vec::new();
@@ -160,7 +162,7 @@ pub fn load(options: &LoadOptions, mut each: impl FnMut(&LoadReport)) -> Result<
                     packet_bytes,
                     due: vec![0.0; options.rooms],
                 };
-                let report = run(options, server, *disturbed, feed)?;
+                let report = run(options, cores, server, *disturbed, feed)?;
                 if !is_plain {
                     packet_bytes = (report.packet_bytes.round() as usize).max(16);
                 }
@@ -201,8 +203,13 @@ fn session() -> Result<(&'static str, Vec<[&'static str; 2]>), LoadError> {
     Ok((hello, frames.filter(|frames| !frames.is_empty()).ok_or_else(broken)?))
 }
 
-fn run(options: &LoadOptions, server: &'static str, disturbed: bool, feed: Feed<'_>) -> Result<LoadReport, LoadError> {
-    let cores = Cores::choose().filter(|cores| cores.server != cores.generator);
+fn run(
+    options: &LoadOptions,
+    cores: Option<Cores>,
+    server: &'static str,
+    disturbed: bool,
+    feed: Feed<'_>,
+) -> Result<LoadReport, LoadError> {
     let words: Vec<String> = match server {
         "plain" => vec!["plain-server".into()],
         _ => {
@@ -270,7 +277,7 @@ fn run(options: &LoadOptions, server: &'static str, disturbed: bool, feed: Feed<
         packet_bytes: seen.num_bytes as f64 / frames_seen.max(1) as f64,
         cpu_percent: 100.0 * cpu / seconds,
         cpu_micros_a_frame: 1e6 * cpu / frames_seen.max(1) as f64,
-        others_percent: busy.map_or(0.0, |busy| (100.0 * (busy - cpu) / seconds).max(0.0)),
+        others_percent: busy.map(|busy| (100.0 * (busy - cpu) / seconds).max(0.0)),
         generator_percent: 100.0 * (own_after.cpu_seconds - own_before.cpu_seconds) / seconds,
         memory_idle_bytes: idle.memory_bytes,
         memory_bytes: after.memory_bytes,

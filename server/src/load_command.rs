@@ -112,10 +112,11 @@ fn shown(report: &LoadReport) -> String {
         mib(report.memory_growth_bytes()),
         report.memory_growth_bytes() as f64 / 1024.0 / report.viewers as f64
     );
-    text += &format!(
-        "  noise     others took {:.1} % of the server's core, the generator {:.1} % of its own",
-        report.others_percent, report.generator_percent
-    );
+    let others = match report.others_percent {
+        Some(percent) => format!("others took {percent:.1} % of the server's core"),
+        None => "there is one core for all".into(),
+    };
+    text += &format!("  noise     {others}, the generator {:.1} % of a core", report.generator_percent);
     if report.frames_held > 0 || report.viewers_lost > 0 || report.reconnects > 0 {
         text += &format!(
             "\n  peers     {} frames held by publishers, {} viewers lost, {} connections made anew",

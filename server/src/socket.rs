@@ -158,7 +158,10 @@ where
             return;
         }
         drop(first);
-        talk(WebSocketStream::from_partially_read(stream, parts.read_buf.to_vec(), Role::Server, Some(config)).await).await;
+        // Hyper's buffer is 8 KiB, whatever it holds: what is kept here is kept for as long as the socket lives.
+        let already_read = parts.read_buf.to_vec();
+        drop(parts.read_buf);
+        talk(WebSocketStream::from_partially_read(stream, already_read, Role::Server, Some(config)).await).await;
         drop(place);
     });
     let mut answer = Response::new(Body::empty());

@@ -21,6 +21,9 @@ const STAY: Duration = Duration::from_millis(500);
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(60);
 /// Bytes a publisher holds for a server that does not read; frames beyond are not sent, and counted.
 const MOST_UNSENT: usize = 64 << 10;
+/// For so long after an event the generator asks for the next one without sleeping: else every send of the server would have to
+/// wake it, which costs the server as much as the send, and which no viewer on another machine asks of it.
+const SPIN: Duration = Duration::from_micros(200);
 /// Events between two looks at the frames that are due.
 const EVENTS_A_LOOK: usize = 32;
 
@@ -121,6 +124,7 @@ pub(super) struct Generator<'a> {
     buffer: Vec<u8>,
     message: Vec<u8>,
     problem: Option<String>,
+    last_event: Instant,
     /// The earliest frame that is due, seconds from `start`.
     next_due: f64,
     /// A key packet of the read that is being handled: number, bytes of payload.
@@ -175,6 +179,7 @@ impl<'a> Generator<'a> {
             buffer: vec![0; 64 << 10],
             message: Vec::new(),
             problem: None,
+            last_event: Instant::now(),
             next_due: 0.0,
             pending_key: None,
         };
@@ -206,12 +211,17 @@ impl<'a> Generator<'a> {
             next = next.min(self.publish(fps));
         }
         self.meet();
-        let timeout = next.saturating_duration_since(Instant::now());
+        let now = Instant::now();
+        let is_in_burst = publishes && now < self.last_event + SPIN;
+        let timeout = if is_in_burst { Duration::ZERO } else { next.saturating_duration_since(now) };
         let mut events = std::mem::replace(&mut self.events, Events::with_capacity(0));
         match self.poll.poll(&mut events, Some(timeout)) {
             Ok(()) => {}
             Err(error) if error.kind() == ErrorKind::Interrupted => {}
             Err(source) => return Err(LoadError::System { what: "wait for sockets", source }),
+        }
+        if !events.is_empty() {
+            self.last_event = Instant::now();
         }
         for (k, event) in events.iter().enumerate() {
             let at = event.token().0;
