@@ -238,6 +238,13 @@ impl Rooms {
         self.metrics.rooms.set(by_name.len() as i64);
     }
 
+    /// Wakes every viewer as a new state would: they look whether the service ends.
+    pub fn wake_viewers(&self) {
+        for room in lock(&self.by_name).values() {
+            room.slot.send_modify(|_| {});
+        }
+    }
+
     /// All rooms, by name.
     pub fn list(&self) -> Vec<RoomListing> {
         let rooms: Vec<Arc<Room>> = lock(&self.by_name).values().cloned().collect();

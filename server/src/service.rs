@@ -166,6 +166,7 @@ pub async fn run(
     drop(listener);
     // Receivers live in the hub, so this cannot fail.
     let _ = stop.send(true);
+    hub.rooms.wake_viewers();
     drop((app, hub));
     if tokio::time::timeout(SHUTDOWN_TIMEOUT, tasks_end.recv()).await.is_err() {
         tracing::warn!("some sockets did not close in time");

@@ -11,7 +11,9 @@ use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, frame_bytes
 use futures_util::{SinkExt, StreamExt};
 use rhytid_shared::RoomName;
 use rhytid_shared::view::{ViewHello, ViewMessage};
+use std::future::{Future, poll_fn};
 use std::sync::Arc;
+use std::task::Poll;
 use std::time::Duration;
 use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
@@ -55,17 +57,15 @@ pub(crate) fn first_frames(hub: &Hub, room: &RoomName) -> Vec<u8> {
 
 /// Sends `viewing`'s states until one side ends it.
 pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing, wants_json: bool) {
-    let mut shutdown = hub.shutdown.clone();
-    let stop = tokio::select! {
-        biased;
-        () = stopped(&mut shutdown) => Ending::shutdown().into(),
-        stop = run(&hub, &mut socket, &mut viewing, wants_json) => stop,
-    };
+    let stop = run(&hub, &mut socket, &mut viewing, wants_json).await;
     drop(viewing);
     end(socket, stop, &hub.metrics).await;
 }
 
-/// Sends states until the viewer is gone or does not answer. May be dropped at any await.
+/// Sends states until the viewer is gone or does not answer, or the service ends.
+///
+/// This is what a frame costs, once for each viewer, so nothing is done twice: the state's slot also says that the service
+/// ends, one timer stays where it is until it is due, and a write gets a time-out only when it has to wait.
 async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: bool) -> Stop {
     let timeouts = &hub.config.timeouts;
     let (idle, ping_interval, write) = (seconds(timeouts.viewer_idle), seconds(timeouts.ping), seconds(timeouts.write));
@@ -73,16 +73,44 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
     let mut sent = Sent::default();
     // A state that stands there already is news to this viewer.
     viewing.slot.mark_changed();
+    let mut has_news = false;
+    let timer = tokio::time::sleep_until(Instant::now() + idle);
+    tokio::pin!(timer);
     loop {
         let now = Instant::now();
+        if has_news && pace.has_credit(now) {
+            has_news = false;
+            let latest = viewing.slot.borrow_and_update().clone();
+            if let Some(latest) = latest {
+                pace.last_packet = now;
+                let with_ping = pace.takes_ping(now);
+                match within(hub, write, send_state(hub, socket, &latest, wants_json, with_ping, &mut sent)).await {
+                    Ok(true) => {}
+                    Ok(false) => return Stop::Gone("connection_lost"),
+                    Err(stop) => return stop,
+                }
+            }
+        }
         if now >= pace.last_heard + idle {
             let message = format!("no pong for {} seconds", timeouts.viewer_idle);
             return Ending::error(CloseCode::Policy, ErrorMessage::new("idle", message)).into();
         }
-        let has_credit = pace.has_credit(now);
+        // Mostly it is due later than the timer says; then the timer is moved when it fires.
         let wake = pace.next_wake(ping_interval, now).min(pace.last_heard + idle);
+        if wake < timer.deadline() {
+            timer.as_mut().reset(wake);
+        }
         tokio::select! {
             biased;
+            changed = viewing.slot.changed() => {
+                if changed.is_err() {
+                    return Stop::Gone("closed");
+                }
+                if *hub.shutdown.borrow() {
+                    return Ending::shutdown().into();
+                }
+                has_news = true;
+            }
             message = socket.next() => match message {
                 Some(Ok(Message::Pong(_))) => pace.hear(Instant::now()),
                 Some(Ok(Message::Close(_))) | None => return Stop::Gone("closed"),
@@ -90,29 +118,31 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
                 Some(Ok(_)) => {}
                 Some(Err(error)) => return broken(error, LARGEST_MESSAGE),
             },
-            changed = viewing.slot.changed(), if has_credit => {
-                if changed.is_err() {
-                    return Stop::Gone("closed");
-                }
-                let latest = viewing.slot.borrow_and_update().clone();
-                let Some(latest) = latest else { continue };
+            () = timer.as_mut() => {
                 let now = Instant::now();
-                pace.last_packet = now;
-                let with_ping = pace.takes_ping(now);
-                match tokio::time::timeout(write, send_state(hub, socket, &latest, wants_json, with_ping, &mut sent)).await {
-                    Ok(true) => {}
-                    Ok(false) => return Stop::Gone("connection_lost"),
-                    Err(_) => return Stop::Gone("write_timeout"),
-                }
-            }
-            () = tokio::time::sleep_until(wake) => {
-                if pace.takes_ping(Instant::now())
+                if now >= wake
+                    && pace.takes_ping(now)
                     && let Err(stop) = send(socket, Message::Ping(Bytes::new()), write).await
                 {
                     return stop;
                 }
+                timer.as_mut().reset(pace.next_wake(ping_interval, now).min(pace.last_heard + idle));
             }
         }
+    }
+}
+
+/// The output of `sending`, or why it did not get there. The usual case is that the kernel takes everything at once.
+async fn within<T>(hub: &Hub, timeout: Duration, sending: impl Future<Output = T>) -> Result<T, Stop> {
+    tokio::pin!(sending);
+    if let Poll::Ready(output) = poll_fn(|cx| Poll::Ready(sending.as_mut().poll(cx))).await {
+        return Ok(output);
+    }
+    let mut shutdown = hub.shutdown.clone();
+    tokio::select! {
+        biased;
+        () = stopped(&mut shutdown) => Err(Ending::shutdown().into()),
+        output = tokio::time::timeout(timeout, sending) => output.map_err(|_| Stop::Gone("write_timeout")),
     }
 }
 
