@@ -16,8 +16,6 @@ use std::time::{Duration, Instant};
 
 /// A frame that comes later than this shows a face as it was, not as it is: about what people notice between sound and picture.
 const USEFUL_WITHIN: Duration = Duration::from_millis(100);
-/// Before the measuring: connections settle, allocators have what they want.
-const WARM_UP: Duration = Duration::from_secs(2);
 /// After a server's start: what it has is what an idle one has.
 const SETTLE: Duration = Duration::from_millis(300);
 /// What a packet takes in the mean, bytes, where no run has shown it.
@@ -55,6 +53,8 @@ pub struct LoadOptions {
     pub fps: f64,
     /// Seconds that are measured in each run.
     pub seconds: f64,
+    /// Seconds of the same before the measuring: connections settle, sessions find their neutral faces.
+    pub warm_up: f64,
     /// Share of the viewers, 0 to 1, that read nothing after the hello.
     pub stalled: f64,
     /// Share of the viewers, 0 to 1, that stay for half a second and connect again.
@@ -183,6 +183,9 @@ fn check(options: &LoadOptions) -> Result<(), LoadError> {
     if !(1.0..=1000.0).contains(&options.fps) || !(1.0..=3600.0).contains(&options.seconds) || options.rounds == 0 {
         return refuse("frames a second must be 1 to 1000, seconds 1 to 3600, rounds at least 1");
     }
+    if !(0.0..=3600.0).contains(&options.warm_up) {
+        return refuse("seconds of warm-up must be 0 to 3600");
+    }
     let shares = [options.stalled, options.reconnecting];
     if shares.iter().any(|share| !(0.0..=1.0).contains(share)) || shares.iter().sum::<f64>() > 0.9 {
         return refuse("stalled and reconnecting viewers must be 90 % at most, so that somebody is left to measure");
@@ -236,7 +239,7 @@ fn run(
         reconnecting: share(options.reconnecting),
     };
     let mut generator = Generator::connect(process.address, &crowd, feed)?;
-    generator.run(options.fps, WARM_UP, false)?;
+    generator.run(options.fps, Duration::from_secs_f64(options.warm_up), false)?;
 
     let own_usage = || Usage::of("self").map_err(|source| LoadError::System { what: "read this process's use of time", source });
     let (before, own_before) = (process.usage()?, own_usage()?);
@@ -309,6 +312,7 @@ mod tests {
             LoadOptions { viewers: 20_000, ..sound.clone() },
             LoadOptions { fps: f64::NAN, ..sound.clone() },
             LoadOptions { stalled: 0.5, reconnecting: 0.5, ..sound.clone() },
+            LoadOptions { warm_up: -1.0, ..sound.clone() },
             LoadOptions { rounds: 0, ..sound.clone() },
         ] {
             assert!(matches!(check(&wrong), Err(LoadError::Options(_))), "{wrong:?}");

@@ -5,8 +5,8 @@ use clap::Args;
 use rhytid_server::load::{LoadOptions, LoadReport, load as measure, serve_plain};
 use std::io::Write;
 
-/// How many times as fast `--overload` publishes.
-const OVERLOAD: f64 = 8.0;
+/// How many times as many viewers `--overload` has: more than one core serves one by one.
+const OVERLOAD: usize = 6;
 
 #[derive(Args)]
 pub(crate) struct LoadArgs {
@@ -22,13 +22,16 @@ pub(crate) struct LoadArgs {
     /// Seconds that are measured, of each run.
     #[arg(long, default_value_t = 10.0, value_name = "N")]
     seconds: f64,
+    /// Seconds of the same before the measuring: connections settle, sessions find their neutral faces.
+    #[arg(long, default_value_t = 2.0, value_name = "N")]
+    warm_up: f64,
     /// So many of the viewers read nothing any more, e.g. 5%; also measured without.
     #[arg(long, default_value = "0%", value_parser = parse_share, value_name = "PERCENT")]
     stalled: f64,
     /// So many of the viewers stay for half a second and connect again, e.g. 5%; also measured without.
     #[arg(long, default_value = "0%", value_parser = parse_share, value_name = "PERCENT")]
     reconnecting: f64,
-    /// Publish eight times as fast.
+    /// Six times as many viewers, more than a core can serve: useful are frames that come within 100 ms.
     #[arg(long)]
     overload: bool,
     /// Also measure a plain broadcast server (axum and a tokio broadcast channel, which solves nothing), turn by turn.
@@ -51,10 +54,11 @@ fn parse_share(text: &str) -> Result<f64, String> {
 pub(crate) async fn load(args: LoadArgs) -> anyhow::Result<()> {
     raise_file_limit();
     let options = LoadOptions {
-        viewers: args.viewers,
+        viewers: args.viewers * if args.overload { OVERLOAD } else { 1 },
         rooms: args.rooms,
-        fps: args.fps * if args.overload { OVERLOAD } else { 1.0 },
+        fps: args.fps,
         seconds: args.seconds,
+        warm_up: args.warm_up,
         stalled: args.stalled,
         reconnecting: args.reconnecting,
         baseline: args.baseline,
