@@ -8,6 +8,7 @@ mod fetch;
 mod inbox;
 #[cfg(test)]
 mod tests;
+mod wire;
 
 pub use address::{AddressError, ServerAddress};
 pub use inbox::{FrameArrival, LinkNews};
@@ -16,6 +17,7 @@ use backoff::Backoff;
 use connection::Ended;
 use inbox::Inbox;
 use rhytid_shared::RoomName;
+use rhytid_shared::trust::Trust;
 use rhytid_shared::view::ViewHello;
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -28,6 +30,8 @@ pub struct LinkOptions {
     pub server: ServerAddress,
     /// Which room.
     pub room: RoomName,
+    /// Whom to trust where the server is encrypted.
+    pub trust: Trust,
     /// SHA-256 (lower-case hex) of the character that is there already and need not be fetched.
     pub known_sha256: Option<String>,
 }

@@ -3,6 +3,7 @@
 use crate::link::{CharacterSource, Link, LinkOptions, LinkState, LinkStats, ServerAddress};
 use crate::playout::{Playout, PlayoutState, PlayoutStats};
 use crate::renderer::RenderFrame;
+use rhytid_shared::trust::Trust;
 use rhytid_shared::{Character, RoomName};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,11 +12,19 @@ use std::time::{Duration, Instant};
 #[derive(Debug, Clone, PartialEq, Eq, clap::Args)]
 pub struct WatchArgs {
     /// The server
-    #[arg(default_value = "ws://127.0.0.1:7878", value_name = "ws://HOST[:PORT]")]
+    #[arg(default_value = "ws://127.0.0.1:7878", value_name = "ws[s]://HOST[:PORT]")]
     pub server: ServerAddress,
     /// The room
     #[arg(long, default_value = "demo", value_parser = RoomName::new)]
     pub room: RoomName,
+    /// Whom to trust on wss://: the fingerprint that `serve --tls-self-signed` printed, or a PEM file of authorities; else the
+    /// public ones
+    #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
+    pub trust: Trust,
+}
+
+fn parse_trust(text: &str) -> Result<Trust, String> {
+    if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
 }
 
 /// Watches one room: takes what the link brings, keeps the playout, says what is the matter.
@@ -70,8 +79,8 @@ impl Spectator {
     /// Starts watching. `character` is the one that is there already; `wake` is called on the link's thread whenever
     /// something came.
     pub fn open(watch: WatchArgs, character: Arc<Character>, wake: impl Fn() + Send + 'static) -> Self {
-        let WatchArgs { server, room } = watch;
-        let options = LinkOptions { server: server.clone(), room: room.clone(), known_sha256: Some(character.sha256.clone()) };
+        let WatchArgs { server, room, trust } = watch;
+        let options = LinkOptions { server: server.clone(), room: room.clone(), trust, known_sha256: Some(character.sha256.clone()) };
         Self {
             link: Link::open(options, wake),
             playout: Playout::new(&character),

@@ -56,6 +56,8 @@ pub struct ServerConfig {
     pub timeouts: Timeouts,
     /// Who may come from a browser.
     pub access: Access,
+    /// Encryption.
+    pub tls: Tls,
     /// The solve.
     pub solve: SolveConfig,
 }
@@ -68,6 +70,7 @@ impl Default for ServerConfig {
             limits: Limits::default(),
             timeouts: Timeouts::default(),
             access: Access::default(),
+            tls: Tls::default(),
             solve: SolveConfig::default(),
         }
     }
@@ -159,6 +162,22 @@ pub struct Access {
     pub origins: Vec<String>,
 }
 
+/// Encryption. Without any of it the server speaks plain HTTP. A phone's camera and a browser's WebGPU need it, except on
+/// loopback.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Deserialize, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+pub struct Tls {
+    /// Serve https and wss with this certificate (PEM, its chain behind it); read again when it changes.
+    #[arg(id = "tls-cert", long = "tls-cert", value_name = "FILE.pem", requires = "tls-key")]
+    pub cert: Option<PathBuf>,
+    /// The private key of --tls-cert (PEM).
+    #[arg(id = "tls-key", long = "tls-key", value_name = "FILE.pem", requires = "tls-cert")]
+    pub key: Option<PathBuf>,
+    /// Serve https and wss with a certificate made at the start, and print its fingerprint.
+    #[arg(id = "tls-self-signed", long = "tls-self-signed", conflicts_with = "tls-cert")]
+    pub self_signed: bool,
+}
+
 impl ServerConfig {
     /// Reads a TOML file; fields it does not name keep their defaults.
     pub fn from_file(path: &Path) -> Result<Self, ServerConfigError> {
@@ -206,6 +225,7 @@ impl ServerConfig {
                 return Err(ServerConfigError::Range { field, got: got.to_string(), expected: "0.01 to 86400 seconds" });
             }
         }
+        crate::tls::validate(&self.tls)?;
         Ok(self.solve.validate()?)
     }
 }

@@ -20,9 +20,11 @@ mod service;
 mod socket;
 pub mod solve;
 mod stream;
+mod tls;
 mod viewer;
 
 pub use clip::{Clip, ClipError, ClipReader};
-pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts};
+pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts, Tls};
 pub use send::{SendError, SendOptions, SendReport, SendSource, send};
 pub use service::{ServerError, bind, load_character, run};
+pub use tls::{Identity, TlsError};

@@ -6,7 +6,10 @@ mod load_command;
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
-use rhytid_server::{Access, Clip, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, bind, load_character, run, send};
+use rhytid_server::{
+    Access, Clip, Identity, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, Tls, bind, load_character, run, send,
+};
+use rhytid_shared::trust::Trust;
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -60,6 +63,8 @@ struct ServeArgs {
     timeouts: Timeouts,
     #[command(flatten)]
     access: Access,
+    #[command(flatten)]
+    tls: Tls,
 }
 
 #[derive(Args)]
@@ -91,6 +96,14 @@ struct SendArgs {
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     #[arg(long, default_value = "15", value_name = "SECONDS", value_parser = parse_seconds)]
     timeout: Duration,
+    /// Whom to trust on wss://: the fingerprint that `serve --tls-self-signed` printed, or a PEM file of authorities; else the
+    /// public ones
+    #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
+    trust: Trust,
+}
+
+fn parse_trust(text: &str) -> Result<Trust, String> {
+    if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
 }
 
 fn parse_speed(text: &str) -> Result<f64, String> {
@@ -176,6 +189,10 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     config.character = args.character.or(config.character);
     config.access.hosts.extend(args.access.hosts);
     config.access.origins.extend(args.access.origins);
+    // Given by flags it is whole, whatever the file says.
+    if args.tls != Tls::default() {
+        config.tls = args.tls;
+    }
     config.validate()?;
     raise_file_limit();
 
@@ -183,12 +200,18 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     // Before the port is bound: who sees the line below may connect, and a broken character must not leave a port behind.
     let character = load_character(config.character.as_deref())?;
     let listener = bind(&config.listen).await?;
+    let identity = Identity::load(&config.tls, listener.local_addr()?, &config.access.hosts)?;
+    let scheme = if identity.is_some() { "https" } else { "http" };
+    let mut greeting = format!("listening on {scheme}://{}\n", listener.local_addr()?);
+    if let Some(identity) = &identity {
+        greeting += &format!("certificate SHA-256 {}\n", identity.fingerprint());
+    }
     let mut output = std::io::stdout();
-    if let Err(error) = writeln!(output, "listening on http://{}", listener.local_addr()?).and_then(|()| output.flush()) {
+    if let Err(error) = output.write_all(greeting.as_bytes()).and_then(|()| output.flush()) {
         // Who closed it does not want to know; who connects is served all the same.
         tracing::warn!(%error, "cannot write to standard output");
     }
-    run(listener, config, character, async move { interrupt.wait().await }).await?;
+    run(listener, config, character, identity, async move { interrupt.wait().await }).await?;
     Ok(())
 }
 
@@ -260,6 +283,7 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         repeats: args.repeats,
         takeover: args.takeover,
         timeout: args.timeout,
+        trust: args.trust,
     };
     let mut interrupt = Signals::new().context("cannot wait for signals")?;
     let report = send(&options, &progress, async move { interrupt.wait().await }).await;

@@ -6,6 +6,7 @@ use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use indicatif::ProgressBar;
 use rhytid_shared::TrackingFrame;
+use rhytid_shared::trust::Trust;
 use rhytid_shared::view::SUBPROTOCOL;
 use serde::Deserialize;
 use std::future::Future;
@@ -21,7 +22,7 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::http::{HeaderValue, header};
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::{self, Message};
-use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async};
+use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
 
 /// How long the server may take to read what is on its way and to close.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(120);
@@ -78,6 +79,8 @@ pub struct SendOptions {
     pub takeover: bool,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     pub timeout: Duration,
+    /// Whom to trust where `to` is `wss://`.
+    pub trust: Trust,
 }
 
 /// What was sent.
@@ -212,7 +215,8 @@ async fn connect(options: &SendOptions) -> Result<Socket, SendError> {
     let connecting = async {
         let mut request = url.as_str().into_client_request()?;
         request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
-        connect_async(request).await
+        let config = options.trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
+        connect_async_tls_with_config(request, None, false, Some(Connector::Rustls(config))).await
     };
     let problem = match tokio::time::timeout(options.timeout, connecting).await {
         Ok(Ok((socket, _))) => return Ok(socket),

@@ -5,7 +5,8 @@ use crate::http::router;
 use crate::metrics::Metrics;
 use crate::room::Rooms;
 use crate::socket::{ErrorMessage, say_and_close};
-use crate::stream::TimedStream;
+use crate::stream::{TimedStream, Wire};
+use crate::tls::{self, Identity, TlsError};
 use axum::extract::Request;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use rhytid_shared::packet::PacketLayout;
@@ -19,6 +20,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, mpsc, watch};
+use tokio_rustls::TlsAcceptor;
 use tokio_tungstenite::tungstenite::Bytes;
 use tower_service::Service as _;
 
@@ -57,6 +59,9 @@ pub enum ServerError {
         /// What is wrong with it.
         source: CharacterError,
     },
+    /// There is no certificate.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
     /// The address could not be listened on.
     #[error("cannot listen on {address}: {source}")]
     Listen {
@@ -117,11 +122,12 @@ pub async fn bind(address: &str) -> Result<TcpListener, ServerError> {
 }
 
 /// Serves a character, with the `.glb` it was read from, on `listener` until `shutdown` is done, then closes every socket with
-/// a reason.
+/// a reason. With an `identity` every connection is encrypted.
 pub async fn run(
     listener: TcpListener,
     config: ServerConfig,
     (character, glb): (Arc<Character>, Vec<u8>),
+    mut identity: Option<Identity>,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServerError> {
     config.validate()?;
@@ -148,13 +154,18 @@ pub async fn run(
     let app = router(hub.clone());
     tracing::info!(%address, character = hub.character.name, "serving");
     tokio::pin!(shutdown);
+    let acceptor = identity.as_ref().map(Identity::acceptor);
+    let mut reload = tokio::time::interval(tls::RELOAD_INTERVAL);
     let mut sweep = tokio::time::interval(SWEEP_INTERVAL.min(seconds(hub.config.timeouts.room_idle)));
     loop {
         tokio::select! {
             () = &mut shutdown => break,
             _ = sweep.tick() => hub.rooms.sweep(seconds(hub.config.timeouts.room_idle)),
+            _ = reload.tick() => if let Some(identity) = &mut identity {
+                identity.reload();
+            },
             accepted = listener.accept() => match accepted {
-                Ok((stream, peer)) => accept(&hub, stream, peer, &app),
+                Ok((stream, peer)) => accept(&hub, stream, peer, &app, acceptor.as_ref()),
                 Err(error) => {
                     tracing::warn!(%error, "cannot accept a connection");
                     tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -175,15 +186,23 @@ pub async fn run(
 }
 
 /// Serves one connection in a task of its own, unless there are too many.
-fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Router) {
+fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Router, acceptor: Option<&TlsAcceptor>) {
     prepare(&stream);
     let place = match Place::take(hub, peer.ip()) {
         Ok(place) => place,
-        Err(error) => return refuse(hub, stream, peer, &error),
+        Err(error) => return refuse(hub, stream, peer, &error, acceptor.is_some()),
     };
-    let (hub, app) = (hub.clone(), app.clone());
+    let (hub, app, acceptor) = (hub.clone(), app.clone(), acceptor.cloned());
     tokio::spawn(async move {
         let place = Arc::new(place);
+        let wire = match &acceptor {
+            None => Wire::Plain(stream),
+            // In a box of its own: what a handshake needs would stay with the task for as long as the connection lives.
+            Some(acceptor) => match Box::pin(tls::shake_hands(&hub, acceptor, stream, peer)).await {
+                Some(wire) => wire,
+                None => return,
+            },
+        };
         // Every request learns where it comes from, and a WebSocket keeps the connection's place.
         let service = hyper::service::service_fn(move |request: hyper::Request<hyper::body::Incoming>| {
             let mut request: Request = request.map(axum::body::Body::new);
@@ -195,7 +214,7 @@ fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Route
             .timer(TokioTimer::new())
             .header_read_timeout(seconds(hub.config.timeouts.hello))
             .max_buf_size(MAX_REQUEST_HEAD)
-            .serve_connection(TokioIo::new(TimedStream::new(stream, seconds(hub.config.timeouts.write))), service)
+            .serve_connection(TokioIo::new(TimedStream::new(wire, seconds(hub.config.timeouts.write))), service)
             .with_upgrades();
         tokio::pin!(connection);
         let mut shutdown = hub.shutdown.clone();
@@ -212,10 +231,14 @@ fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Route
     });
 }
 
-/// Tells a connection that there are too many, in a task of its own where there is room for one.
-fn refuse(hub: &Hub, stream: TcpStream, peer: SocketAddr, error: &ErrorMessage) {
+/// Tells a connection that there are too many, in a task of its own where there is room for one. An encrypted one is cut: a
+/// handshake costs more than the word is worth.
+fn refuse(hub: &Hub, stream: TcpStream, peer: SocketAddr, error: &ErrorMessage, is_encrypted: bool) {
     hub.metrics.end(error.code);
     tracing::debug!(%peer, message = error.message, "connection refused");
+    if is_encrypted {
+        return;
+    }
     let Ok(permit) = hub.refusals.clone().try_acquire_owned() else { return };
     let body = serde_json::to_string(error).expect("plain data can be written");
     let answer = format!(
@@ -223,7 +246,7 @@ fn refuse(hub: &Hub, stream: TcpStream, peer: SocketAddr, error: &ErrorMessage) 
         body.len()
     );
     tokio::spawn(async move {
-        say_and_close(stream, answer.as_bytes()).await;
+        say_and_close(Wire::Plain(stream), answer.as_bytes()).await;
         drop(permit);
     });
 }

@@ -2,7 +2,7 @@
 
 use crate::metrics::Metrics;
 use crate::service::{Hub, Place, stopped};
-use crate::stream::TimedStream;
+use crate::stream::{TimedStream, Wire};
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -15,7 +15,6 @@ use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
@@ -24,7 +23,7 @@ use tokio_tungstenite::tungstenite::protocol::{CloseFrame, Role, WebSocketConfig
 use tokio_tungstenite::tungstenite::{Error, Message};
 
 /// A server's end of a WebSocket.
-pub(crate) type Socket = WebSocketStream<TcpStream>;
+pub(crate) type Socket = WebSocketStream<Wire>;
 
 /// How long a peer may take to answer a close before its connection is cut.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
@@ -143,7 +142,7 @@ where
     tokio::spawn(async move {
         let parts = match upgraded.await.map(hyper::upgrade::Upgraded::downcast::<TokioIo<TimedStream>>) {
             Ok(Ok(parts)) => parts,
-            Ok(Err(_)) => return tracing::error!("an upgraded connection is not the TCP stream it was"),
+            Ok(Err(_)) => return tracing::error!("an upgraded connection is not the stream it was"),
             Err(error) => return tracing::debug!(%error, "the upgrade did not happen"),
         };
         let mut stream = parts.io.into_inner().into_inner();
@@ -286,7 +285,7 @@ async fn farewell(mut socket: Socket) {
 }
 
 /// Says the last word on a connection that has not become a socket.
-pub(crate) async fn say_and_close(mut stream: TcpStream, bytes: &[u8]) {
+pub(crate) async fn say_and_close(mut stream: Wire, bytes: &[u8]) {
     let saying = async {
         if stream.write_all(bytes).await.is_ok() {
             drain(&mut stream).await;
@@ -298,7 +297,7 @@ pub(crate) async fn say_and_close(mut stream: TcpStream, bytes: &[u8]) {
 
 /// Ends the sending half, then reads what still comes and throws it away, up to [`MOST_DRAINED`] bytes: a connection that is
 /// dropped with unread bytes is reset, and a reset takes the bytes on their way to the peer with it.
-async fn drain(stream: &mut TcpStream) {
+async fn drain(stream: &mut Wire) {
     if stream.shutdown().await.is_err() {
         return;
     }

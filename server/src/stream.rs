@@ -1,4 +1,5 @@
-//! A connection below HTTP, whose writes have a time-out: a peer that takes nothing would hold its place for ever.
+//! A connection below HTTP: plain or encrypted, and with a time-out for writes, as a peer that takes nothing would hold its
+//! place for ever.
 
 use std::future::Future;
 use std::io::{self, IoSlice};
@@ -8,22 +9,77 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::time::Sleep;
+use tokio_rustls::server::TlsStream;
 
-/// A TCP stream that fails a write which makes no headway for a time.
+/// A connection's bytes. The encrypted kind has its state elsewhere, so that the plain kind stays as small as it is.
+pub(crate) enum Wire {
+    /// As they are.
+    Plain(TcpStream),
+    /// Under TLS.
+    Encrypted(Box<TlsStream<TcpStream>>),
+}
+
+impl AsyncRead for Wire {
+    fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        match self.get_mut() {
+            Self::Plain(stream) => Pin::new(stream).poll_read(cx, buffer),
+            Self::Encrypted(stream) => Pin::new(stream).poll_read(cx, buffer),
+        }
+    }
+}
+
+impl AsyncWrite for Wire {
+    fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        match self.get_mut() {
+            Self::Plain(stream) => Pin::new(stream).poll_write(cx, bytes),
+            Self::Encrypted(stream) => Pin::new(stream).poll_write(cx, bytes),
+        }
+    }
+
+    fn poll_write_vectored(self: Pin<&mut Self>, cx: &mut Context<'_>, slices: &[IoSlice<'_>]) -> Poll<io::Result<usize>> {
+        match self.get_mut() {
+            Self::Plain(stream) => Pin::new(stream).poll_write_vectored(cx, slices),
+            Self::Encrypted(stream) => Pin::new(stream).poll_write_vectored(cx, slices),
+        }
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        match self {
+            Self::Plain(stream) => stream.is_write_vectored(),
+            Self::Encrypted(stream) => stream.is_write_vectored(),
+        }
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match self.get_mut() {
+            Self::Plain(stream) => Pin::new(stream).poll_flush(cx),
+            Self::Encrypted(stream) => Pin::new(stream).poll_flush(cx),
+        }
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match self.get_mut() {
+            Self::Plain(stream) => Pin::new(stream).poll_shutdown(cx),
+            Self::Encrypted(stream) => Pin::new(stream).poll_shutdown(cx),
+        }
+    }
+}
+
+/// A connection that fails a write which makes no headway for a time.
 pub(crate) struct TimedStream {
-    stream: TcpStream,
+    stream: Wire,
     timeout: Duration,
     /// Runs while a write waits; made only then, so that most connections have none.
     waiting: Option<Pin<Box<Sleep>>>,
 }
 
 impl TimedStream {
-    pub fn new(stream: TcpStream, timeout: Duration) -> Self {
+    pub fn new(stream: Wire, timeout: Duration) -> Self {
         Self { stream, timeout, waiting: None }
     }
 
-    /// The stream itself.
-    pub fn into_inner(self) -> TcpStream {
+    /// The connection itself.
+    pub fn into_inner(self) -> Wire {
         self.stream
     }
 

@@ -12,6 +12,8 @@ pub mod packet;
 #[cfg(test)]
 mod testing;
 mod tracking;
+#[cfg(feature = "trust")]
+pub mod trust;
 pub mod view;
 
 pub use character::{Character, CharacterError};

@@ -10,4 +10,5 @@ mod service {
     pub mod neutral;
     pub mod rooms;
     pub mod sending;
+    pub mod tls;
 }

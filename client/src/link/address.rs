@@ -8,9 +8,10 @@ use tungstenite::http::Uri;
 /// Port of a server that says nothing else.
 const DEFAULT_PORT: u16 = 7878;
 
-/// Host and port of a server, written `ws://HOST[:PORT]`.
+/// Host and port of a server, written `ws://HOST[:PORT]`, or `wss://HOST[:PORT]` where it is encrypted.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ServerAddress {
+    is_encrypted: bool,
     /// Name or address; IPv6 in brackets.
     host: String,
     port: u16,
@@ -20,16 +21,8 @@ pub struct ServerAddress {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum AddressError {
     /// Not of the form.
-    #[error("server address {got:?} is not ws://HOST[:PORT]")]
+    #[error("server address {got:?} is not ws://HOST[:PORT] or wss://HOST[:PORT]")]
     Form {
-        /// What was given.
-        got: String,
-    },
-    /// Encrypted, which this client does not speak.
-    #[error(
-        "server address {got:?} asks for TLS, which this viewer does not speak; use ws://HOST[:PORT], through a tunnel where the way is not safe"
-    )]
-    Encrypted {
         /// What was given.
         got: String,
     },
@@ -43,7 +36,12 @@ impl ServerAddress {
 
     /// A path on the same server over HTTP. `path` must begin with a slash.
     pub(super) fn http_url(&self, path: &str) -> String {
-        format!("http://{}:{}{path}", self.host, self.port)
+        format!("{}://{}:{}{path}", if self.is_encrypted { "https" } else { "http" }, self.host, self.port)
+    }
+
+    /// True where the way there is under TLS.
+    pub(super) fn is_encrypted(&self) -> bool {
+        self.is_encrypted
     }
 
     /// As `ToSocketAddrs` wants it: IPv6 without its brackets.
@@ -54,7 +52,7 @@ impl ServerAddress {
 
 impl fmt::Display for ServerAddress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "ws://{}:{}", self.host, self.port)
+        write!(f, "{}://{}:{}", if self.is_encrypted { "wss" } else { "ws" }, self.host, self.port)
     }
 }
 
@@ -64,14 +62,14 @@ impl FromStr for ServerAddress {
     fn from_str(text: &str) -> Result<Self, AddressError> {
         let form = || AddressError::Form { got: text.to_owned() };
         let uri: Uri = text.parse().map_err(|_| form())?;
-        match uri.scheme_str() {
-            Some("ws") => {}
-            Some("wss" | "https") => return Err(AddressError::Encrypted { got: text.to_owned() }),
+        let is_encrypted = match uri.scheme_str() {
+            Some("ws") => false,
+            Some("wss") => true,
             _ => return Err(form()),
-        }
+        };
         let authority = uri.authority().ok_or_else(form)?;
         // `Uri` takes users, empty ports, paths and queries as well; none of them means anything here.
-        let rest = text.strip_prefix("ws://").unwrap_or_default();
+        let rest = text.split_once("://").map_or("", |(_, rest)| rest);
         let is_plain =
             rest.strip_suffix('/').unwrap_or(rest) == authority.as_str() && !rest.contains('@') && !authority.as_str().ends_with(':');
         if !is_plain || authority.host().is_empty() {
@@ -83,7 +81,7 @@ impl FromStr for ServerAddress {
             None => return Err(form()),
             Some(port) => port.as_str().parse().ok().filter(|&port| port != 0).ok_or_else(form)?,
         };
-        Ok(Self { host: authority.host().to_owned(), port })
+        Ok(Self { is_encrypted, host: authority.host().to_owned(), port })
     }
 }
 
@@ -97,6 +95,7 @@ mod tests {
             ("ws://127.0.0.1:7878", "ws://127.0.0.1:7878"),
             ("ws://face.example/", "ws://face.example:7878"),
             ("ws://[::1]:80", "ws://[::1]:80"),
+            ("wss://face.example:443", "wss://face.example:443"),
         ] {
             assert_eq!(text.parse::<ServerAddress>().map(|address| address.to_string()), Ok(want.to_owned()));
         }
@@ -123,6 +122,7 @@ mod tests {
             let error = text.parse::<ServerAddress>().unwrap_err();
             assert!(error.to_string().contains("ws://HOST[:PORT]"), "{text}: {error}");
         }
-        assert!(matches!("wss://host".parse::<ServerAddress>(), Err(AddressError::Encrypted { .. })));
+        let encrypted: ServerAddress = "wss://host".parse().unwrap();
+        assert_eq!(encrypted.http_url("/characters/a.glb"), "https://host:7878/characters/a.glb");
     }
 }

@@ -1,10 +1,12 @@
 //! One connection, from its first byte to its last.
 
 use super::inbox::Inbox;
+use super::wire::Wire;
 use super::{CharacterSource, Connected, LinkOptions, fetch};
 use rhytid_shared::FaceFrame;
 use rhytid_shared::packet::{Decoder, PacketLayout};
 use rhytid_shared::view::{PROTOCOL_VERSION, SUBPROTOCOL, ViewHello, ViewMessage};
+use rustls::CertificateError;
 use std::io::ErrorKind;
 use std::net::{TcpStream, ToSocketAddrs};
 use std::time::{Duration, Instant};
@@ -64,7 +66,7 @@ pub(super) fn watch(options: &mut LinkOptions, inbox: &Inbox, wake: &dyn Fn()) -
     ended
 }
 
-fn connect(options: &LinkOptions) -> Result<WebSocket<TcpStream>, Ended> {
+fn connect(options: &LinkOptions) -> Result<WebSocket<Wire>, Ended> {
     let lost = |why: String| Ended::Lost(why);
     let (host, port) = options.server.host_and_port();
     let addresses = (host, port).to_socket_addrs().map_err(|error| lost(format!("{host} is not known: {error}")))?;
@@ -79,6 +81,7 @@ fn connect(options: &LinkOptions) -> Result<WebSocket<TcpStream>, Ended> {
         stream.set_write_timeout(Some(CONNECT_TIMEOUT))
     };
     set_up().map_err(|error| lost(error.to_string()))?;
+    let stream = Wire::new(stream, &options.server, &options.trust).map_err(|error| untrusted(&error))?;
 
     let uri = options.server.view_uri(&options.room);
     let uri = uri.parse().map_err(|error| Ended::Refused(format!("{uri} is no address: {error}")))?;
@@ -89,8 +92,22 @@ fn connect(options: &LinkOptions) -> Result<WebSocket<TcpStream>, Ended> {
         HandshakeError::Interrupted(_) => lost("the server does not answer".into()),
         HandshakeError::Failure(error) => refusal(error),
     })?;
-    socket.get_ref().set_read_timeout(Some(LOOK_UP)).map_err(|error| lost(error.to_string()))?;
+    socket.get_ref().tcp().set_read_timeout(Some(LOOK_UP)).map_err(|error| lost(error.to_string()))?;
     Ok(socket)
+}
+
+/// A certificate that is not trusted will not be the next time either.
+fn untrusted(error: &std::io::Error) -> Ended {
+    match error.get_ref().and_then(|inner| inner.downcast_ref::<rustls::Error>()) {
+        Some(rustls::Error::InvalidCertificate(CertificateError::ApplicationVerificationFailure)) => {
+            Ended::Refused("the server's certificate has another fingerprint than --trust says".into())
+        }
+        Some(rustls::Error::InvalidCertificate(why)) => {
+            Ended::Refused(format!("the server's certificate is not trusted ({why}); --trust FINGERPRINT or FILE.pem trusts one"))
+        }
+        Some(rustls::Error::InvalidMessage(_)) => Ended::Refused("the server does not speak TLS; use ws://".into()),
+        _ => Ended::Lost(plain_words(error)),
+    }
 }
 
 /// Which failed handshakes will fail again.
@@ -124,7 +141,7 @@ fn plain_words(error: &std::io::Error) -> String {
 }
 
 struct Connection<'a> {
-    socket: WebSocket<TcpStream>,
+    socket: WebSocket<Wire>,
     options: &'a mut LinkOptions,
     inbox: &'a Inbox,
     wake: &'a dyn Fn(),
@@ -234,7 +251,7 @@ impl Connection<'_> {
         let character = if self.options.known_sha256.as_ref() == Some(wanted) {
             CharacterSource::Known
         } else {
-            let glb = fetch::character(&self.options.server, &hello.character.url, wanted)
+            let glb = fetch::character(&self.options.server, &self.options.trust, &hello.character.url, wanted)
                 .map_err(|error| Ended::NoCharacter(error.to_string()))?;
             self.options.known_sha256 = Some(wanted.clone());
             CharacterSource::Fetched(glb)

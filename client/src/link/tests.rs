@@ -5,6 +5,7 @@
 use super::*;
 use crate::spectator::{Spectator, Status, StatusKind, WatchArgs};
 use rhytid_shared::packet::{Encoder, PacketLayout};
+use rhytid_shared::trust::Trust;
 use rhytid_shared::view::{BoneHello, CharacterHello, PROTOCOL_VERSION, PoseHello, SUBPROTOCOL, ViewMessage};
 use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB};
 use sha2::{Digest, Sha256};
@@ -28,7 +29,7 @@ impl TestServer {
 
     fn options(&self, known_sha256: &str) -> LinkOptions {
         let server = format!("ws://{}", self.listener.local_addr().unwrap()).parse().unwrap();
-        LinkOptions { server, room: RoomName::new("demo").unwrap(), known_sha256: Some(known_sha256.to_owned()) }
+        LinkOptions { server, room: RoomName::new("demo").unwrap(), trust: Trust::Public, known_sha256: Some(known_sha256.to_owned()) }
     }
 
     /// The next connection, which must ask for the room's socket with the subprotocol.
@@ -340,8 +341,11 @@ fn character_elsewhere_is_not_fetched() {
 /// A spectator of the two-bone character, its server's first connection accepted and greeted.
 fn watch(server: &TestServer) -> (Spectator, Socket) {
     let character = two_bones();
-    let spectator =
-        Spectator::open(WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap() }, Arc::new(character), || ());
+    let spectator = Spectator::open(
+        WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap(), trust: Trust::Public },
+        Arc::new(character),
+        || (),
+    );
     let mut socket = server.accept();
     send_hello(&mut socket, &hello("a"));
     (spectator, socket)
@@ -414,7 +418,7 @@ fn status_says_that_the_server_is_gone_and_when_it_is_back() {
 #[test]
 fn status_tells_attempts_in_vain_and_refusals() {
     let server = TestServer::start();
-    let watched = WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap() };
+    let watched = WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap(), trust: Trust::Public };
     let mut spectator = Spectator::open(watched.clone(), Arc::new(two_bones()), || ());
     assert_eq!(spectator.status(Instant::now()).kind, StatusKind::Connecting);
     server.accept_with(|_, _| {

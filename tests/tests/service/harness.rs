@@ -1,6 +1,6 @@
 //! A server on a free port, and clients for it.
 
-use rhytid_server::{ServerConfig, bind, load_character, run};
+use rhytid_server::{Identity, ServerConfig, bind, load_character, run};
 use rhytid_shared::FaceFrame;
 use rhytid_shared::packet::{Decoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{JsonFrame, ViewHello, ViewMessage};
@@ -46,7 +46,8 @@ impl Server {
                 }
                 bound.send(address).unwrap();
                 let character = load_character(config.character.as_deref()).unwrap();
-                run(listener, config, character, async { drop(stopped.await) }).await.unwrap();
+                let identity = Identity::load(&config.tls, address, &[]).unwrap();
+                run(listener, config, character, identity, async { drop(stopped.await) }).await.unwrap();
             });
         });
         Self { address: address.recv().unwrap(), stop: Some(stop), thread: Some(thread) }

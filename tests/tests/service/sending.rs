@@ -2,6 +2,7 @@
 
 use super::harness::Server;
 use rhytid_server::{SendError, SendOptions, SendReport, SendSource, send};
+use rhytid_shared::trust::Trust;
 use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant};
 use tungstenite::handshake::server::{ErrorResponse, Request, Response};
@@ -24,6 +25,7 @@ fn options(server: &Server, text: String) -> SendOptions {
         repeats: false,
         takeover: false,
         timeout: Duration::from_secs(15),
+        trust: Trust::Public,
     }
 }
 
