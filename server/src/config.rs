@@ -3,6 +3,7 @@
 use crate::solve::SolveConfig;
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use serde::Deserialize;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -37,6 +38,15 @@ pub enum ServerConfigError {
         /// The range.
         expected: &'static str,
     },
+    /// Everybody could do everything.
+    #[error(
+        "others can reach this address, so it must be said who may do what: give --token-key FILE (rhytid-server token --new-key FILE \
+         makes one), or --insecure where everybody may do everything"
+    )]
+    Open,
+    /// The keys of the tokens cannot be had.
+    #[error(transparent)]
+    Token(#[from] crate::token::TokenError),
     /// A setting of the solve makes no sense.
     #[error(transparent)]
     Solve(#[from] crate::solve::ConfigError),
@@ -95,12 +105,18 @@ pub struct Limits {
     /// Bad frames in a row that end a publisher's session.
     #[arg(id = "max-bad-frames", long = "max-bad-frames", default_value_t = Self::default().bad_frames_in_a_row, value_name = "N")]
     pub bad_frames_in_a_row: u32,
-    /// Connections altogether, each a file descriptor and about 16 KiB.
+    /// Connections altogether, each a file descriptor and about 5 KiB.
     #[arg(id = "max-connections-in-all", long = "max-connections-in-all", default_value_t = Self::default().connections, value_name = "N")]
     pub connections: usize,
     /// Connections from one address, or one /64 of IPv6; does not hold for loopback.
     #[arg(id = "max-connections", long = "max-connections", default_value_t = Self::default().connections_per_address, value_name = "N")]
     pub connections_per_address: usize,
+    /// New connections a second from one address, after a burst of four seconds' worth; does not hold for loopback.
+    #[arg(id = "max-connection-rate", long = "max-connection-rate", default_value_t = Self::default().connections_per_second, value_name = "N")]
+    pub connections_per_second: u32,
+    /// Messages a second from all publishers of one address; faster ones are slowed down. Does not hold for loopback.
+    #[arg(id = "max-address-fps", long = "max-address-fps", default_value_t = Self::default().frames_per_second_per_address, value_name = "N")]
+    pub frames_per_second_per_address: u32,
 }
 
 impl Default for Limits {
@@ -112,10 +128,14 @@ impl Default for Limits {
             // Five percent of a core, and 16 times a fast face camera.
             frames_per_second: 1000,
             bad_frames_in_a_row: 100,
-            // A quarter of a gigabyte of viewers.
+            // Under a hundred megabytes of viewers.
             connections: 16_384,
             // A class behind one router.
             connections_per_address: 256,
+            // A page that loads and its sockets, several times over.
+            connections_per_second: 16,
+            // A studio of sixty faces.
+            frames_per_second_per_address: 4000,
         }
     }
 }
@@ -150,7 +170,7 @@ impl Default for Timeouts {
     }
 }
 
-/// Who may come from a browser. Programs that send no `Origin` are not asked.
+/// Who may come, and from where in a browser. Programs that send no `Origin` are not asked for it.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 pub struct Access {
@@ -160,6 +180,12 @@ pub struct Access {
     /// Origins of other sites whose pages may use and read it, e.g. `https://example.org` (repeat for several).
     #[arg(long = "allow-origin", value_name = "ORIGIN")]
     pub origins: Vec<String>,
+    /// Demand tokens signed with a key of this file (`rhytid-server token` makes both); read again when it changes.
+    #[arg(long = "token-key", value_name = "FILE")]
+    pub token_key: Option<PathBuf>,
+    /// Listen for other machines without tokens, or take tokens without TLS.
+    #[arg(long = "insecure")]
+    pub insecure: bool,
 }
 
 /// Encryption. Without any of it the server speaks plain HTTP. A phone's camera and a browser's WebGPU need it, except on
@@ -190,6 +216,13 @@ impl ServerConfig {
         })
     }
 
+    /// Checks that a server on `address` knows who may do what: off loopback it needs keys of tokens, or to be told that it
+    /// does not.
+    pub fn check_access(&self, address: SocketAddr) -> Result<(), ServerConfigError> {
+        let access = &self.access;
+        crate::token::demand(access.token_key.as_deref(), access.insecure, address.ip().is_loopback()).map(drop)
+    }
+
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ServerConfigError> {
         let limits = &self.limits;
@@ -200,6 +233,8 @@ impl ServerConfig {
             ("limits.bad_frames_in_a_row", limits.bad_frames_in_a_row as usize, 1_000_000),
             ("limits.connections", limits.connections, 1_000_000),
             ("limits.connections_per_address", limits.connections_per_address, 1_000_000),
+            ("limits.connections_per_second", limits.connections_per_second as usize, 1_000_000),
+            ("limits.frames_per_second_per_address", limits.frames_per_second_per_address as usize, 1_000_000),
         ] {
             if got == 0 || got > most {
                 return Err(ServerConfigError::Range { field, got: got.to_string(), expected: "1 to 1000000" });

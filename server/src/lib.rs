@@ -21,6 +21,7 @@ mod socket;
 pub mod solve;
 mod stream;
 mod tls;
+mod token;
 mod viewer;
 
 pub use clip::{Clip, ClipError, ClipReader};
@@ -28,3 +29,4 @@ pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts, Tls}
 pub use send::{SendError, SendOptions, SendReport, SendSource, send};
 pub use service::{ServerError, bind, load_character, run};
 pub use tls::{Identity, TlsError};
+pub use token::{Claims, Role, TokenError, make_key_file, make_token};

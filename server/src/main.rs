@@ -2,6 +2,7 @@
 
 #[cfg(target_os = "linux")]
 mod load_command;
+mod token_command;
 
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
@@ -37,6 +38,8 @@ enum Command {
     Serve(Box<ServeArgs>),
     /// Publish a feed file, or an animation clip of a character.
     Send(SendArgs),
+    /// Make a token, or a key that signs tokens.
+    Token(token_command::TokenArgs),
     /// Measure: a server on one core, its publishers and viewers on another.
     #[cfg(target_os = "linux")]
     Load(load_command::LoadArgs),
@@ -100,6 +103,13 @@ struct SendArgs {
     /// public ones
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     trust: Trust,
+    /// What lets it in, where the server wants to know; also from the environment's RHYTID_TOKEN. Others on this machine can read
+    /// the arguments of a command.
+    #[arg(long, conflicts_with = "token_file")]
+    token: Option<String>,
+    /// A file with the token.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
 }
 
 fn parse_trust(text: &str) -> Result<Trust, String> {
@@ -130,6 +140,7 @@ async fn main() -> ExitCode {
     let result = match cli.command {
         Command::Serve(args) => serve(*args, matches.subcommand_matches("serve")).await,
         Command::Send(args) => send_feed(args).await,
+        Command::Token(args) => token_command::token(&args),
         #[cfg(target_os = "linux")]
         Command::Load(args) => load_command::load(args).await,
         #[cfg(target_os = "linux")]
@@ -179,6 +190,8 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "max-bad-frames": limits.bad_frames_in_a_row,
         "max-connections-in-all": limits.connections,
         "max-connections": limits.connections_per_address,
+        "max-connection-rate": limits.connections_per_second,
+        "max-address-fps": limits.frames_per_second_per_address,
         "hello-timeout": timeouts.hello,
         "ping-interval": timeouts.ping,
         "publisher-timeout": timeouts.publisher_idle,
@@ -189,6 +202,8 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     config.character = args.character.or(config.character);
     config.access.hosts.extend(args.access.hosts);
     config.access.origins.extend(args.access.origins);
+    config.access.token_key = args.access.token_key.or(config.access.token_key);
+    config.access.insecure |= args.access.insecure;
     // Given by flags it is whole, whatever the file says.
     if args.tls != Tls::default() {
         config.tls = args.tls;
@@ -200,6 +215,7 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     // Before the port is bound: who sees the line below may connect, and a broken character must not leave a port behind.
     let character = load_character(config.character.as_deref())?;
     let listener = bind(&config.listen).await?;
+    config.check_access(listener.local_addr()?)?;
     let identity = Identity::load(&config.tls, listener.local_addr()?, &config.access.hosts)?;
     let scheme = if identity.is_some() { "https" } else { "http" };
     let mut greeting = format!("listening on {scheme}://{}\n", listener.local_addr()?);
@@ -284,6 +300,7 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         takeover: args.takeover,
         timeout: args.timeout,
         trust: args.trust,
+        token: token_command::given(args.token, args.token_file.as_deref())?,
     };
     let mut interrupt = Signals::new().context("cannot wait for signals")?;
     let report = send(&options, &progress, async move { interrupt.wait().await }).await;

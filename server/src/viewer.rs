@@ -56,8 +56,8 @@ pub(crate) fn first_frames(hub: &Hub, room: &RoomName) -> Vec<u8> {
 }
 
 /// Sends `viewing`'s states until one side ends it.
-pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing, wants_json: bool) {
-    let stop = run(&hub, &mut socket, &mut viewing, wants_json).await;
+pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing, wants_json: bool, expires: Option<Instant>) {
+    let stop = run(&hub, &mut socket, &mut viewing, wants_json, expires).await;
     drop(viewing);
     end(socket, stop, &hub.metrics).await;
 }
@@ -66,7 +66,7 @@ pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing
 ///
 /// This is what a frame costs, once for each viewer, so nothing is done twice: the state's slot also says that the service
 /// ends, one timer stays where it is until it is due, and a write gets a time-out only when it has to wait.
-async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: bool) -> Stop {
+async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: bool, expires: Option<Instant>) -> Stop {
     let timeouts = &hub.config.timeouts;
     let (idle, ping_interval, write) = (seconds(timeouts.viewer_idle), seconds(timeouts.ping), seconds(timeouts.write));
     let mut pace = Pace::new(Instant::now());
@@ -95,8 +95,12 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
             let message = format!("no pong for {} seconds", timeouts.viewer_idle);
             return Ending::error(CloseCode::Policy, ErrorMessage::new("idle", message)).into();
         }
+        if expires.is_some_and(|end| now >= end) {
+            return Ending::token_expired().into();
+        }
         // Mostly it is due later than the timer says; then the timer is moved when it fires.
-        let wake = pace.next_wake(ping_interval, now).min(pace.last_heard + idle);
+        let end = expires.map_or(pace.last_heard + idle, |end| end.min(pace.last_heard + idle));
+        let wake = pace.next_wake(ping_interval, now).min(end);
         if wake < timer.deadline() {
             timer.as_mut().reset(wake);
         }
@@ -126,7 +130,7 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
                 {
                     return stop;
                 }
-                timer.as_mut().reset(pace.next_wake(ping_interval, now).min(pace.last_heard + idle));
+                timer.as_mut().reset(pace.next_wake(ping_interval, now).min(end));
             }
         }
     }

@@ -26,6 +26,7 @@ fn options(server: &Server, text: String) -> SendOptions {
         takeover: false,
         timeout: Duration::from_secs(15),
         trust: Trust::Public,
+        token: None,
     }
 }
 
