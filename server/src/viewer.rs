@@ -312,4 +312,94 @@ mod tests {
             assert!(num_sent >= least, "{num_sent} of 250 frames at a round trip of {round_trip} ms");
         }
     }
+
+    /// A link that keeps its order: packets wait while it stalls, and all of them come when it goes on. Times in milliseconds.
+    #[derive(Debug, Clone)]
+    struct Weather {
+        delay: u64,
+        jitter: u64,
+        stall_every: u64,
+        stall: u64,
+        /// When the connection breaks, and what is under way with it; the viewer comes back after `away`.
+        breaks_at: u64,
+        away: u64,
+    }
+
+    /// What one viewer sees of frames that come every `interval` for `time`: index and time of arrival, connection by connection.
+    fn simulate(weather: &Weather, interval: u64, time: u64, seed: u64) -> Vec<Vec<(u64, u64)>> {
+        let start = Instant::now();
+        let at = |millis: u64| start + Duration::from_millis(millis);
+        let mut random = seed;
+        let mut arrival = |sent: u64, last: u64| {
+            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let mut arrives = sent + weather.delay + (random >> 33) % (weather.jitter + 1);
+            let into = arrives % weather.stall_every;
+            if into < weather.stall {
+                arrives += weather.stall - into;
+            }
+            arrives.max(last)
+        };
+        let mut seen = Vec::new();
+        for (from, to) in [(0, weather.breaks_at), (weather.breaks_at + weather.away, u64::MAX)] {
+            let (mut pace, mut sent_state) = (Pace::new(at(from)), 0);
+            // Pings whose answers are on their way; the first went out with the hello.
+            let mut pongs = std::collections::VecDeque::new();
+            let (mut down, mut up) = (from, from);
+            let mut came = Vec::new();
+            down = arrival(from, down);
+            up = arrival(down, up);
+            pongs.push_back(up);
+            // Long enough after the last frame for a trickle.
+            for now in from..to.min(time + 5000) {
+                while pongs.front().is_some_and(|due| *due <= now) {
+                    pongs.pop_front();
+                    pace.hear(at(now));
+                }
+                // The slot holds the newest state alone.
+                let newest = now.min(time) / interval;
+                if newest > sent_state && pace.has_credit(at(now)) {
+                    pace.last_packet = at(now);
+                    down = arrival(now, down);
+                    if pace.takes_ping(at(now)) {
+                        up = arrival(down, up);
+                        pongs.push_back(up);
+                    }
+                    sent_state = newest;
+                    if down < to {
+                        came.push((newest, down));
+                    }
+                }
+            }
+            seen.push(came);
+        }
+        seen
+    }
+
+    proptest::proptest! {
+        #![proptest_config(proptest::prelude::ProptestConfig::with_cases(64))]
+
+        #[test]
+        fn viewer_never_sees_an_older_frame_after_a_newer_one_and_ends_on_the_last(
+            delay in 0..400_u64, jitter in 0..100_u64, stall_every in 1000..5000_u64, stall in 0..900_u64,
+            breaks_at in 500..8000_u64, away in 0..2000_u64, interval in 1..100_u64, seed: u64,
+        ) {
+            const TIME: u64 = 8000;
+            let weather = Weather { delay, jitter, stall_every, stall, breaks_at, away };
+            let seen = simulate(&weather, interval, TIME, seed);
+            for came in &seen {
+                proptest::prop_assert!(came.windows(2).all(|pair| pair[0].0 < pair[1].0 && pair[0].1 <= pair[1].1), "{weather:?}");
+            }
+            let newest = seen.iter().flatten().map(|(index, _)| *index).collect::<Vec<_>>();
+            proptest::prop_assert!(newest.is_sorted(), "a connection made anew begins with the newest state");
+            proptest::prop_assert_eq!(newest.last(), Some(&(TIME / interval)));
+            // However long the link stalls: what comes then was sent within the window and the ping before it.
+            let most = delay + jitter + stall + stall + WINDOW.as_millis() as u64 + PING_SPACING.as_millis() as u64;
+            for (index, arrived) in seen.iter().flatten() {
+                if (index + 1) * interval < TIME.min(breaks_at) {
+                    let age = arrived - index * interval;
+                    proptest::prop_assert!(age <= most + interval + TRICKLE.as_millis() as u64, "a packet is {age} ms old: {weather:?}");
+                }
+            }
+        }
+    }
 }

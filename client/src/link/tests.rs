@@ -29,7 +29,13 @@ impl TestServer {
 
     fn options(&self, known_sha256: &str) -> LinkOptions {
         let server = format!("ws://{}", self.listener.local_addr().unwrap()).parse().unwrap();
-        LinkOptions { server, room: RoomName::new("demo").unwrap(), trust: Trust::Public, known_sha256: Some(known_sha256.to_owned()) }
+        LinkOptions {
+            server,
+            room: RoomName::new("demo").unwrap(),
+            trust: Trust::Public,
+            token: None,
+            known_sha256: Some(known_sha256.to_owned()),
+        }
     }
 
     /// The next connection, which must ask for the room's socket with the subprotocol.
@@ -418,7 +424,7 @@ fn status_says_that_the_server_is_gone_and_when_it_is_back() {
 #[test]
 fn status_tells_attempts_in_vain_and_refusals() {
     let server = TestServer::start();
-    let watched = WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap(), trust: Trust::Public };
+    let watched = WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap(), trust: Trust::Public, token: None };
     let mut spectator = Spectator::open(watched.clone(), Arc::new(two_bones()), || ());
     assert_eq!(spectator.status(Instant::now()).kind, StatusKind::Connecting);
     server.accept_with(|_, _| {
