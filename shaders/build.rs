@@ -6,8 +6,23 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 /// Passes: each file holds the entry points of one.
-const PASSES: [&str; 13] =
-    ["background", "eye", "hair", "influence", "normals", "plain", "present", "scatter", "shadow", "skin", "tone", "wet", "wireframe"];
+const PASSES: [&str; 15] = [
+    "background",
+    "deltas",
+    "eye",
+    "hair",
+    "influence",
+    "masks",
+    "normals",
+    "plain",
+    "present",
+    "scatter",
+    "shadow",
+    "skin",
+    "tone",
+    "wet",
+    "wireframe",
+];
 /// Parts that are exported by themselves, too: tests build passes of their own from them.
 const PARTS: [&str; 3] = ["skinning", "surface", "wrinkles"];
 /// `//!include NAME` on a line of its own puts `NAME.wgsl` there, once.

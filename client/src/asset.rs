@@ -205,8 +205,11 @@ pub struct MaterialAsset {
     pub normal: Option<MipChain>,
     /// Largest slope the codes of `normal` reach.
     pub normal_scale: f32,
-    /// Ambient occlusion in red, roughness in green, both linear and 1 where a map is missing.
+    /// Ambient occlusion in red, roughness in green, both linear and 1 where a map is missing; in blue, where
+    /// `has_intensity`, the strength of highlights: code 128 is 1.
     pub surface_map: Option<MipChain>,
+    /// The surface map has a blue channel.
+    pub has_intensity: bool,
     /// Multiplies the roughness of the map.
     pub roughness: f32,
     /// How much of the occlusion map is applied, 0 to 1.

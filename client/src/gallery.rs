@@ -3,7 +3,6 @@
 
 mod bones;
 mod easel;
-mod expressions;
 mod maps;
 mod timing;
 mod zones;

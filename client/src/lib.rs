@@ -2,22 +2,37 @@
 //! how is none of its business; only the `embedded` feature links the server, to run it in this process.
 
 pub mod asset;
+pub mod playout;
+pub mod renderer;
+pub mod twin;
+
+#[cfg(not(target_arch = "wasm32"))]
+mod native {
+    pub use crate::link::{Link, LinkOptions, LinkState, LinkStats, ServerAddress};
+    pub use crate::renderer::{Headless, RenderError};
+    pub use crate::spectator::{Spectator, Status, StatusKind};
+}
+#[cfg(not(target_arch = "wasm32"))]
 pub mod film;
 #[cfg(feature = "embedded")]
 pub mod gallery;
+#[cfg(not(target_arch = "wasm32"))]
 pub mod link;
+#[cfg(not(target_arch = "wasm32"))]
 mod picture_size;
-pub mod playout;
 #[cfg(feature = "embedded")]
 pub mod render_cli;
-pub mod renderer;
+#[cfg(not(target_arch = "wasm32"))]
 mod sheet;
+#[cfg(not(target_arch = "wasm32"))]
 pub mod spectator;
-pub mod twin;
+#[cfg(not(target_arch = "wasm32"))]
 pub mod view;
+#[cfg(target_arch = "wasm32")]
+pub mod web;
 
 pub use asset::{AssetError, CharacterAsset};
-pub use link::{Link, LinkOptions, LinkState, LinkStats, ServerAddress};
+#[cfg(not(target_arch = "wasm32"))]
+pub use native::*;
 pub use playout::{Playout, PlayoutState, PlayoutStats};
-pub use renderer::{BlendMode, Camera, Deformation, DrawSettings, Headless, RenderError, RenderFrame, Renderer, ViewMode};
-pub use spectator::{Spectator, Status, StatusKind};
+pub use renderer::{BlendMode, Camera, Deformation, DrawSettings, RenderFrame, Renderer, ViewMode};

@@ -112,7 +112,8 @@ pub struct PictureArgs {
     /// Pixels, WIDTHxHEIGHT
     #[arg(long, default_value = "512x512", value_parser = parse_size)]
     pub size: [u32; 2],
-    /// beauty, bare, split, influence, influence:POSE, normals, wireframe, diffuse, specular, scattering, translucency or blood
+    /// beauty, bare, split, influence, influence:POSE, normals, wireframe, diffuse, specular, scattering, translucency, blood, masks, masks:ZONE, bone-masks
+    /// or shape-deltas
     #[arg(long, default_value = "beauty")]
     pub view: String,
     /// How wrinkle maps become normals: pd, simple or printed
@@ -268,7 +269,7 @@ pub fn render(args: &RenderArgs) -> Result<usize> {
     let (mut index, mut num_written) = (0_usize, 0);
     while let Some(item) = feed.next_frame(&mut tracked)? {
         match item {
-            FeedItem::Calibrate => solver.calibrate(),
+            FeedItem::Command(command) => solver.command(&command)?,
             FeedItem::Frame => {
                 solver.solve(&tracked, &mut solved).map_err(|source| PictureError::Frame {
                     path: path.clone(),

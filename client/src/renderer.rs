@@ -6,13 +6,17 @@ mod blood;
 mod camera;
 mod coefficients;
 mod deformation;
+mod device;
 mod environment;
 mod frame;
 mod fullscreen;
+#[cfg(not(target_arch = "wasm32"))]
 mod headless;
 mod layouts;
+mod picture_texture;
 mod pipelines;
 mod present;
+#[cfg(not(target_arch = "wasm32"))]
 mod read_back;
 mod regions;
 pub mod scattering;
@@ -29,9 +33,14 @@ mod zones;
 pub use camera::Camera;
 pub use coefficients::{bone_major, moves_bone, pose_table};
 pub use deformation::{Deformation, DeformationError};
+pub use device::{optional_features, required_limits};
 pub use frame::RenderFrame;
-pub use headless::{AdapterChoice, Headless, RenderError, optional_features, required_limits};
+#[cfg(not(target_arch = "wasm32"))]
+pub use headless::{AdapterChoice, Headless, RenderError};
+#[cfg(not(target_arch = "wasm32"))]
+pub use picture_texture::picture_texture;
 pub use pipelines::VERTEX_LAYOUT;
+#[cfg(not(target_arch = "wasm32"))]
 pub(crate) use read_back::read_back;
 pub use studio::{Studio, StudioError};
 pub use timing::{Pass, PassTimer};
@@ -82,6 +91,8 @@ pub struct DrawSettings {
     pub grain: f32,
     /// Edges are smoothed after the tone map.
     pub is_smoothed: bool,
+    /// No wall is drawn; the picture's alpha is how much of each pixel is covered, its colour is multiplied with that.
+    pub is_transparent: bool,
 }
 
 /// How skin takes light. Each is 1 for human skin unless it says otherwise.
@@ -122,6 +133,7 @@ impl DrawSettings {
             skin: SkinSettings::default(),
             grain: 0.0,
             is_smoothed: true,
+            is_transparent: false,
         }
     }
 }
@@ -310,7 +322,9 @@ impl Renderer {
             at_rest = RenderFrame::at_rest(character);
             &at_rest
         };
-        let weights = settings.deform.weights_of(frame).filter(|_| self.has_shapes);
+        // The view of what shapes do shows what they do.
+        let deform = if settings.view == ViewMode::ShapeDeltas { Deformation::Shapes } else { settings.deform };
+        let weights = deform.weights_of(frame).filter(|_| self.has_shapes);
         let matrices = match weights {
             Some(_) => self.palette.model_from_unposed(character, frame),
             None => self.palette.model_from_rest(character, frame),
@@ -354,7 +368,7 @@ impl Renderer {
             target_encodes_srgb: u32::from(self.presenter.target_encodes_srgb),
             is_split: u32::from(settings.view == ViewMode::Split),
             is_smoothed: u32::from(settings.is_smoothed && settings.view.is_lit()),
-            padding: 0,
+            is_transparent: u32::from(settings.is_transparent),
         };
         queue.write_buffer(&self.presenter.block, 0, bytemuck::bytes_of(&present));
     }
@@ -405,11 +419,12 @@ impl Renderer {
         .inverse();
         let mouth = Mouth::new(character, frame);
         let shown = |k: usize| match settings.view {
-            ViewMode::Influence(None) => 1.0,
-            ViewMode::Influence(Some(only)) if only == k => 1.0,
+            ViewMode::Influence(None) | ViewMode::Masks(None) => 1.0,
+            ViewMode::Influence(Some(only)) | ViewMode::Masks(Some(only)) if only == k => 1.0,
             _ => 0.0,
         };
         let eye = settings.camera.eye();
+        let (mirrored, mirrored_gain) = settings.studio.mirrored();
         uniforms::Frame {
             clip_from_world: settings.camera.clip_from_world(size[0] as f32 / size[1] as f32).to_cols_array_2d(),
             shadow_from_world: settings.studio.shadow_from_world(settings.key_turn, centre, radius).to_cols_array_2d(),
@@ -425,8 +440,8 @@ impl Renderer {
             gazes: gazes(character, frame),
             skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
             blood: [self.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],
-            picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, 0.0, 0.0, 0.0],
-            shown: [shown_term(settings.view), 0, 0, 0],
+            picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, mirrored_gain, 0.0, 0.0],
+            shown: [shown_term(settings.view), mirrored, 0, 0],
             shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
         }
     }
@@ -453,16 +468,21 @@ impl Renderer {
     ) {
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("scene"),
-            color_attachments: &[(&targets.specular_samples, &targets.specular), (&targets.diffuse_samples, &targets.diffuse)].map(
-                |(samples, resolved)| {
-                    Some(wgpu::RenderPassColorAttachment {
-                        view: samples,
-                        depth_slice: None,
-                        resolve_target: Some(resolved),
-                        ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color::BLACK), store: wgpu::StoreOp::Discard },
-                    })
-                },
-            ),
+            color_attachments: &[
+                (&targets.specular_samples, &targets.specular, 1.0),
+                (&targets.diffuse_samples, &targets.diffuse, background::FAR),
+            ]
+            .map(|(samples, resolved, a)| {
+                Some(wgpu::RenderPassColorAttachment {
+                    view: samples,
+                    depth_slice: None,
+                    resolve_target: Some(resolved),
+                    ops: wgpu::Operations {
+                        load: wgpu::LoadOp::Clear(wgpu::Color { r: 0.0, g: 0.0, b: 0.0, a }),
+                        store: wgpu::StoreOp::Discard,
+                    },
+                })
+            }),
             depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
                 view: &targets.depth,
                 depth_ops: Some(wgpu::Operations { load: wgpu::LoadOp::Clear(1.0), store: wgpu::StoreOp::Discard }),
@@ -474,15 +494,20 @@ impl Renderer {
         });
         let stand_off = pipelines::STRAND_STAND_OFF;
         pass.set_blend_constant(wgpu::Color { r: stand_off, g: stand_off, b: stand_off, a: stand_off });
-        pass.set_pipeline(&self.background);
-        pass.draw(0..3, 0..1);
-        self.num_draws += 1;
+        if !settings.is_transparent {
+            pass.set_pipeline(&self.background);
+            pass.draw(0..3, 0..1);
+            self.num_draws += 1;
+        }
         let blend = Look::blend_index(settings.blend);
         match settings.view {
             ViewMode::Beauty | ViewMode::Term(_) => self.draw_primitives(device, &mut pass, settings, Look::Wrinkled(blend)),
             ViewMode::Bare => self.draw_primitives(device, &mut pass, settings, Look::Bare),
             ViewMode::Influence(_) => self.draw_primitives(device, &mut pass, settings, Look::Influence),
             ViewMode::Normals => self.draw_primitives(device, &mut pass, settings, Look::Normals(blend)),
+            ViewMode::Masks(_) => self.draw_primitives(device, &mut pass, settings, Look::ZoneMasks),
+            ViewMode::BoneMasks => self.draw_primitives(device, &mut pass, settings, Look::BoneMasks),
+            ViewMode::ShapeDeltas => self.draw_primitives(device, &mut pass, settings, Look::Deltas),
             ViewMode::Wireframe => self.draw_wireframe(device, &mut pass),
             ViewMode::Split => {
                 let [width, height] = targets.size;
@@ -504,7 +529,11 @@ impl Renderer {
         let (has_bones, has_zones) = self.systems(settings);
         // A map that nothing shows is not read.
         let has_stretch = self.is_stretched;
-        let zones = (if has_zones { settings.zone_blend.number() } else { 0 }, has_stretch);
+        let zones = match look {
+            // Masks are there whatever is drawn with them.
+            Look::ZoneMasks => (1, false),
+            _ => (if has_zones { settings.zone_blend.number() } else { 0 }, has_stretch),
+        };
         // What adds to or covers the rest comes last.
         let rank = |surface: Surface| match surface {
             Surface::Hair => 1,

@@ -1,6 +1,6 @@
 //! Pictures in rows with captions, laid out as one picture.
 
-use crate::renderer::{RenderError, read_back};
+use crate::renderer::{RenderError, picture_texture, read_back};
 use crate::view::{ACCENT, FAINT, Painter, TEXT, apply_look};
 use egui::{Align2, Color32, ColorImage, CornerRadius, FontId, Pos2, Rect, Stroke, TextureHandle, TextureOptions, Vec2, pos2, vec2};
 use image::RgbaImage;
@@ -211,16 +211,7 @@ fn paint(
     mut output: egui::FullOutput,
     size: [u32; 2],
 ) -> Result<RgbaImage, RenderError> {
-    let texture = device.create_texture(&wgpu::TextureDescriptor {
-        label: Some("sheet"),
-        size: wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 },
-        mip_level_count: 1,
-        sample_count: 1,
-        dimension: wgpu::TextureDimension::D2,
-        format: FORMAT,
-        usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
-        view_formats: &[],
-    });
+    let texture = picture_texture(device, "sheet", size, FORMAT, wgpu::TextureUsages::COPY_SRC);
     let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
     let mut painter = Painter::new(device, FORMAT);
     painter.upload(device, queue, &mut output.textures_delta);

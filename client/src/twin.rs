@@ -2,6 +2,7 @@
 //! blend, the tone curve. The tests hold these to published and derived numbers, and the GPU to these.
 
 pub mod blood;
+pub mod hues;
 mod morph;
 pub mod skin;
 pub mod zones;

@@ -1,5 +1,7 @@
 //! `view`: a window that shows a room's face live.
 
+pub(crate) mod expressions;
+mod hand;
 mod look;
 mod pages;
 mod painter;
@@ -12,15 +14,16 @@ pub(crate) use look::{ACCENT, FAINT, TEXT, apply as apply_look};
 pub(crate) use painter::Painter;
 
 use crate::asset::{AssetError, CharacterAsset};
-use crate::renderer::{RenderError, ViewError, ViewMode};
+use crate::renderer::{Deformation, RenderError, ViewError, ViewMode};
 use crate::spectator::{Spectator, StatusKind, WatchArgs};
+use hand::HandFace;
 use panel::{Rates, Scene};
 use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB};
 use std::borrow::Cow;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use switches::Switches;
+use switches::{Page, Switches};
 use window::{Canvas, GpuWindow};
 use winit::application::ApplicationHandler;
 use winit::dpi::LogicalSize;
@@ -34,10 +37,14 @@ pub struct ViewArgs {
     /// Whom to watch.
     #[command(flatten)]
     pub watch: WatchArgs,
-    /// What is shown first: beauty, bare, split, influence, influence:POSE, normals or wireframe
+    /// What is shown first: beauty, bare, split, influence, influence:POSE, normals, wireframe, a part of the light, masks,
+    /// bone-masks or shape-deltas
     #[arg(long, value_name = "VIEW", default_value = "beauty")]
     pub view: String,
-    /// Save a picture of the whole window to this PNG once the face has been live for half a second, then close
+    /// Start with the sliders that pose the face in place of the stream; needs no server
+    #[arg(long)]
+    pub by_hand: bool,
+    /// Save a picture of the whole window to this PNG once the face has been live, or by hand, for half a second, then close
     #[arg(long, value_name = "FILE.png")]
     pub screenshot: Option<PathBuf>,
 }
@@ -114,6 +121,10 @@ pub fn run(args: ViewArgs) -> Result<(), WindowError> {
     let character = Arc::clone(&asset.character);
     let mut switches = Switches::new(&character);
     switches.show(ViewMode::parse(&args.view, &character)?);
+    if args.by_hand {
+        switches.hand.is_on = true;
+        switches.page = Page::Hand;
+    }
     let event_loop = EventLoop::<Wake>::with_user_event().build().map_err(|error| WindowError::NoDisplay(plain_words(&error)))?;
     let proxy = event_loop.create_proxy();
     // The event loop is gone only when the window is.
@@ -121,6 +132,7 @@ pub fn run(args: ViewArgs) -> Result<(), WindowError> {
     let mut app = App {
         spectator: Spectator::open(args.watch, Arc::clone(&character), wake),
         switches,
+        hand_face: HandFace::default(),
         character,
         glb: Cow::Borrowed(DEFAULT_CHARACTER_GLB),
         asset: Some(asset),
@@ -152,6 +164,7 @@ fn plain_words(error: &winit::error::EventLoopError) -> String {
 struct App {
     spectator: Spectator,
     switches: Switches,
+    hand_face: HandFace,
     /// The character drawn.
     character: Arc<Character>,
     /// Its file: a device that is lost takes the decoded character with it, which is ten times as large.
@@ -238,18 +251,26 @@ impl App {
             *character = Arc::clone(&new.character);
             Ok(new.character)
         });
-        let frame = self.spectator.sample(now).clone();
+        let streamed = self.spectator.sample(now).clone();
+        let hand = switches.hand.clone();
+        let is_by_hand = hand.is_on;
+        let by_hand = is_by_hand.then(|| self.hand_face.frame(character, &hand));
+        let frame = by_hand.as_ref().unwrap_or(&streamed);
+        if is_by_hand && cfg!(not(feature = "embedded")) {
+            switches.draw.deform = Deformation::Shapes;
+        }
         let status = self.spectator.status(now);
         let link = self.spectator.link_stats();
         self.rates.pictures.note(now, self.pictures);
         self.rates.packets.note(now, link.packets);
         self.rates.bytes.note(now, link.bytes);
-        self.live_since = if status.kind == StatusKind::Live { self.live_since.or(Some(now)) } else { None };
+        self.live_since = if status.kind == StatusKind::Live || is_by_hand { self.live_since.or(Some(now)) } else { None };
 
         let adapter = gpu.adapter_name().to_owned();
         let scene = Scene {
             character,
-            frame: &frame,
+            frame,
+            streamed: &streamed,
             status: &status,
             room: self.spectator.room().as_str(),
             link,
@@ -269,11 +290,13 @@ impl App {
             return Err(WindowError::NeverLive { status: format!("{}: {}", status.headline, status.detail) });
         }
         self.is_surface_hidden = matches!(canvas, Canvas::Hidden);
-        let mut is_moving = self.spectator.is_moving();
+        // The stream goes on, but nothing of it shows while the face is posed by hand.
+        let mut is_moving = self.spectator.is_moving() && !is_by_hand;
         if let Canvas::Ready(canvas) = canvas {
             gpu.draw(canvas, &scene, switches);
             self.pictures += 1;
-            is_moving |= gpu.is_panel_moving();
+            // What the sliders were moved to while this picture was laid out shows in the next one.
+            is_moving |= gpu.is_panel_moving() || switches.hand != hand;
         } else {
             is_moving = true;
         }

@@ -194,7 +194,7 @@ fn film_without_an_adapter_says_what_to_install() -> Result<(), Failed> {
 fn wrong_addresses_and_rooms_are_refused() -> Result<(), Failed> {
     for (args, expected) in [
         (["view", "http://127.0.0.1:7878", "--room", "demo"], "is not ws://HOST[:PORT]"),
-        (["view", "wss://127.0.0.1:7878", "--room", "demo"], "asks for TLS"),
+        (["view", "wss://127.0.0.1:7878", "--trust", "no/such.pem"], "expected a SHA-256 fingerprint or a readable PEM file"),
         (["view", "ws://127.0.0.1:7878", "--room", "a b"], "is not 1 to 64 characters"),
     ] {
         let output = Command::new(CLIENT).args(args).output()?;

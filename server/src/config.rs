@@ -1,11 +1,16 @@
 //! What a user may set: the listening address, the character, every limit and every time-out.
 
 use crate::solve::SolveConfig;
+use crate::token::{self, Keys};
+use crate::trackers::spec::{ListenSpec, VmcOutSpec};
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use serde::Deserialize;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+
+/// Most ports for trackers, and most addresses that get VMC.
+const MOST_PORTS: usize = 64;
 
 /// Why a configuration was refused.
 #[derive(Debug, thiserror::Error)]
@@ -44,9 +49,20 @@ pub enum ServerConfigError {
          makes one), or --insecure where everybody may do everything"
     )]
     Open,
+    /// Everybody could send datagrams to it.
+    #[error(
+        "tokens are demanded, but others can reach {protocol}={address}, and datagrams bear none: say which addresses they may come \
+         from with option allow=IP, or give --insecure"
+    )]
+    OpenPort {
+        /// What it listens for.
+        protocol: &'static str,
+        /// Where.
+        address: SocketAddr,
+    },
     /// The keys of the tokens cannot be had.
     #[error(transparent)]
-    Token(#[from] crate::token::TokenError),
+    Token(#[from] token::TokenError),
     /// A setting of the solve makes no sense.
     #[error(transparent)]
     Solve(#[from] crate::solve::ConfigError),
@@ -60,6 +76,12 @@ pub struct ServerConfig {
     pub listen: String,
     /// The character's `.glb`; the built-in one where there is none.
     pub character: Option<PathBuf>,
+    /// Ports that listen for trackers, each `PROTOCOL=ADDRESS:PORT[,option=value…]`.
+    pub listen_udp: Vec<ListenSpec>,
+    /// Where rooms' faces are sent as VMC, each `ADDRESS:PORT[,room=NAME]`.
+    pub vmc_out: Vec<VmcOutSpec>,
+    /// Folder of performers' profiles, read when the service starts and written when a fit ends.
+    pub profiles: Option<PathBuf>,
     /// How much of everything.
     pub limits: Limits,
     /// How long for everything.
@@ -77,6 +99,9 @@ impl Default for ServerConfig {
         Self {
             listen: "127.0.0.1:7878".into(),
             character: None,
+            listen_udp: Vec::new(),
+            vmc_out: Vec::new(),
+            profiles: None,
             limits: Limits::default(),
             timeouts: Timeouts::default(),
             access: Access::default(),
@@ -209,8 +234,13 @@ impl ServerConfig {
     pub fn from_file(path: &Path) -> Result<Self, ServerConfigError> {
         let shown = path.display().to_string();
         let text = std::fs::read_to_string(path).map_err(|source| ServerConfigError::Io { path: shown.clone(), source })?;
-        toml::from_str(&text).map_err(|error: toml::de::Error| ServerConfigError::Toml {
-            path: shown,
+        Self::from_toml(&text, &shown)
+    }
+
+    /// Reads the text of a file that errors call `shown`.
+    pub(crate) fn from_toml(text: &str, shown: &str) -> Result<Self, ServerConfigError> {
+        toml::from_str(text).map_err(|error: toml::de::Error| ServerConfigError::Toml {
+            path: shown.to_owned(),
             line: 1 + text.bytes().take(error.span().map_or(0, |span| span.start)).filter(|byte| *byte == b'\n').count(),
             problem: error.message().lines().collect::<Vec<_>>().join(", "),
         })
@@ -219,8 +249,21 @@ impl ServerConfig {
     /// Checks that a server on `address` knows who may do what: off loopback it needs keys of tokens, or to be told that it
     /// does not.
     pub fn check_access(&self, address: SocketAddr) -> Result<(), ServerConfigError> {
+        self.keys(address).map(drop)
+    }
+
+    /// The keys of the tokens, where a server on `address` demands them. Datagrams bear none, so then it must be said where they
+    /// may come from.
+    pub(crate) fn keys(&self, address: SocketAddr) -> Result<Option<Keys>, ServerConfigError> {
         let access = &self.access;
-        crate::token::demand(access.token_key.as_deref(), access.insecure, address.ip().is_loopback()).map(drop)
+        let keys = token::demand(access.token_key.as_deref(), access.insecure, address.ip().is_loopback())?;
+        let is_open = |port: &&ListenSpec| port.allow.is_empty() && !port.address.ip().is_loopback();
+        match self.listen_udp.iter().find(is_open) {
+            Some(port) if keys.is_some() && !access.insecure => {
+                Err(ServerConfigError::OpenPort { protocol: port.protocol_name(), address: port.address })
+            }
+            _ => Ok(keys),
+        }
     }
 
     /// Checks every value.
@@ -246,6 +289,12 @@ impl ServerConfig {
                 got: limits.message_bytes.to_string(),
                 expected: "1024 to 16777216",
             });
+        }
+        for (field, got) in [("listen_udp", self.listen_udp.len()), ("vmc_out", self.vmc_out.len())] {
+            // Each is a socket and a task.
+            if got > MOST_PORTS {
+                return Err(ServerConfigError::Range { field, got: format!("a list of {got}"), expected: "at most 64" });
+            }
         }
         let timeouts = &self.timeouts;
         for (field, got) in [
@@ -293,6 +342,7 @@ mod tests {
         assert!(says("[limits]\nroms = 3").contains("unknown field `roms`"), "{}", says("[limits]\nroms = 3"));
         assert!(says("[limits]\nrooms = 0").contains("limits.rooms is 0, expected 1 to"));
         assert!(says("[limits]\nmessage_bytes = 3").contains("limits.message_bytes is 3"));
+        assert!(says("listen_udp = [\"kinect=127.0.0.1:1\"]").contains("protocol is \"kinect\""));
         assert!(says("[timeouts]\nping = -1.0").contains("timeouts.ping is -1"));
         assert!(says("[timeouts]\nping = nan").contains("timeouts.ping is NaN"));
         let missing = ServerConfig::from_file(Path::new("no/such.toml")).unwrap_err().to_string();

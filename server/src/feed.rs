@@ -1,7 +1,8 @@
-//! Feed files: the publish messages of one session, one a line (`.jsonl`).
+//! Feed files: the publish messages of one session, one a line (`.jsonl`), or a recording of Live Link Face (`.csv`).
 
+use crate::trackers::livelink_csv::LiveLinkCsv;
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
-use rhytid_shared::{Character, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
+use rhytid_shared::{Character, Command, MessageError, PublishHello, PublishMessage, PublishReader, TrackingFrame};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -30,16 +31,19 @@ pub enum FeedError {
 }
 
 /// What stands on a line after the hello.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum FeedItem {
     /// A frame, written into the buffer given.
     Frame,
-    /// Take the neutral face now.
-    Calibrate,
+    /// What the publisher asked for between two frames.
+    Command(Command),
 }
 
+/// The lines of a feed file, whatever it is on the disk.
+pub type FeedLines = Box<dyn BufRead + Send>;
+
 /// A feed being read, line by line.
-pub struct Feed<R = BufReader<File>> {
+pub struct Feed<R = FeedLines> {
     /// The first line.
     pub hello: PublishHello,
     path: String,
@@ -80,7 +84,7 @@ impl<R: BufRead> Feed<R> {
         if feed.next_line()? {
             match feed.read(&mut TrackingFrame::default())? {
                 PublishMessage::Hello(first) => hello = first,
-                PublishMessage::Frame | PublishMessage::Calibrate => return Err(feed.refuse(MessageError::new("no_hello", NO_HELLO))),
+                _ => return Err(feed.refuse(MessageError::new("no_hello", NO_HELLO))),
             }
         } else {
             feed.line = 1;
@@ -96,7 +100,7 @@ impl<R: BufRead> Feed<R> {
         }
         match self.read(frame)? {
             PublishMessage::Frame => Ok(Some(FeedItem::Frame)),
-            PublishMessage::Calibrate => Ok(Some(FeedItem::Calibrate)),
+            PublishMessage::Command(command) => Ok(Some(FeedItem::Command(command))),
             PublishMessage::Hello(_) => Err(self.refuse(MessageError::new("repeated_hello", "a feed has one hello, its first line"))),
         }
     }
@@ -147,10 +151,12 @@ impl<R: BufRead> Feed<R> {
     }
 }
 
-fn open(path: &Path) -> Result<(BufReader<File>, String), FeedError> {
+fn open(path: &Path) -> Result<(FeedLines, String), FeedError> {
     let shown = path.display().to_string();
     let file = File::open(path).map_err(|source| FeedError::Io { path: shown.clone(), source })?;
-    Ok((BufReader::with_capacity(1 << 16, file), shown))
+    let lines = BufReader::with_capacity(1 << 16, file);
+    let is_recording = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("csv"));
+    Ok((if is_recording { Box::new(BufReader::new(LiveLinkCsv::new(lines))) } else { Box::new(lines) }, shown))
 }
 
 const NO_HELLO: &str = "the first line must be {\"type\":\"hello\",\"version\":1,…}";

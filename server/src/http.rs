@@ -4,16 +4,16 @@ use crate::config::Access;
 use crate::service::{Hub, Peer, Place};
 use crate::socket::{Ending, ErrorMessage, Handshake, close, tokens, upgrade};
 use crate::token::{Refusal, Role, now_seconds};
-use crate::{publish, viewer};
+use crate::{control, page, publish, viewer};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
-use axum::response::{Html, IntoResponse, Response};
+use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use rhytid_shared::RoomName;
 use rhytid_shared::view::TOKEN_PROTOCOL;
+use rhytid_shared::{RoomName, Slot};
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,14 +23,18 @@ use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 /// All routes.
 pub(crate) fn router(hub: Arc<Hub>) -> Router {
     Router::new()
-        .route("/", get(page))
+        .route("/", get(start_page))
         .route("/healthz", get(async || "ok\n"))
         .route("/metrics", get(metrics))
+        .route("/api/access", get(access))
         .route("/api/rooms", get(rooms))
+        .route("/api/trackers", get(trackers))
+        .route("/api/profiles", get(profiles))
         .route("/characters/{file}", get(character))
         .route("/v1/rooms/{room}/publish", get(publish_socket))
+        .route("/v1/rooms/{room}/control", get(control_socket))
         .route("/v1/rooms/{room}/view", get(view_socket))
-        .fallback(async || ErrorMessage::new("not_found", "there is nothing at this address").response(StatusCode::NOT_FOUND))
+        .fallback(other)
         .layer(from_fn_with_state(hub.clone(), check_browser))
         .with_state(hub)
 }
@@ -151,8 +155,38 @@ fn bearer(headers: &HeaderMap) -> Option<&str> {
     from_header.or_else(|| tokens(headers, &header::SEC_WEBSOCKET_PROTOCOL).find_map(|word| word.strip_prefix(TOKEN_PROTOCOL)))
 }
 
-async fn page() -> Html<&'static str> {
-    Html(include_str!("page.html"))
+async fn start_page(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    page::answer(request.method(), "/", request.headers(), &hub.config.access).unwrap_or_else(|| page::stand_in(&hub.config.access))
+}
+
+async fn other(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    page::answer(request.method(), request.uri().path(), request.headers(), &hub.config.access)
+        .unwrap_or_else(|| ErrorMessage::new("not_found", "there is nothing at this address").response(StatusCode::NOT_FOUND))
+}
+
+/// Whether the bearer of the request's token may act as `role` in `room`, or in all of them. A browser's page, which cannot
+/// read why a socket was refused, asks here.
+async fn access(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    let role = match query_field(&request, "role") {
+        Some("view") => Role::View,
+        Some("publish") => Role::Publish,
+        Some("admin") => Role::Admin,
+        _ => {
+            return ErrorMessage::new("unknown_role", "query field role is expected to be view, publish or admin")
+                .response(StatusCode::BAD_REQUEST);
+        }
+    };
+    let room = match query_field(&request, "room").map(room_name).transpose() {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    match admit(&hub, &request, role, room.as_ref()) {
+        Ok(pass) => {
+            let seconds = pass.expires.map(|end| end.saturating_duration_since(Instant::now()).as_secs());
+            axum::Json(serde_json::json!({ "tokens": hub.tokens.is_some(), "seconds": seconds })).into_response()
+        }
+        Err(answer) => *answer,
+    }
 }
 
 /// In Prometheus's own format, or as OpenMetrics where the reader names that.
@@ -174,6 +208,20 @@ async fn rooms(State(hub): State<Arc<Hub>>, request: Request) -> Response {
         return *answer;
     }
     axum::Json(serde_json::json!({ "rooms": hub.rooms.list() })).into_response()
+}
+
+async fn trackers(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    if let Err(answer) = admit(&hub, &request, Role::Admin, None) {
+        return *answer;
+    }
+    axum::Json(serde_json::json!({ "ports": hub.trackers.list() })).into_response()
+}
+
+async fn profiles(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    if let Err(answer) = admit(&hub, &request, Role::Admin, None) {
+        return *answer;
+    }
+    axum::Json(serde_json::json!({ "profiles": hub.profiles.list() })).into_response()
 }
 
 async fn character(State(hub): State<Arc<Hub>>, Path(file): Path<String>, headers: HeaderMap) -> Response {
@@ -212,13 +260,38 @@ async fn publish_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, r
     upgrade(&hub.clone(), request, handshake, config, Vec::new(), move |socket| publish::talk(hub, socket, room, pass))
 }
 
+async fn control_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
+    let room = match room_name(&room) {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    let slot = query_field(&request, "slot").unwrap_or(Slot::MAIN).to_owned();
+    let handshake = match Handshake::check(&request) {
+        Ok(handshake) => handshake,
+        Err(answer) => return *answer,
+    };
+    // Who speaks for a source may do to its face what its publisher may.
+    let pass = match admit(&hub, &request, Role::Publish, Some(&room)) {
+        Ok(pass) => pass,
+        Err(answer) => return *answer,
+    };
+    let config = publish::socket_config(&hub);
+    let target = control::Target { hub: hub.clone(), room, slot };
+    upgrade(&hub, request, handshake, config, Vec::new(), move |socket| control::talk(target, socket, pass))
+}
+
+/// A field of the request's query.
+fn query_field<'a>(request: &'a Request, name: &str) -> Option<&'a str> {
+    let query = request.uri().query().unwrap_or_default();
+    query.split('&').find_map(|pair| pair.split_once('=').filter(|(key, _)| *key == name)).map(|(_, value)| value)
+}
+
 async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
     let room = match room_name(&room) {
         Ok(room) => room,
         Err(error) => return error.response(StatusCode::BAD_REQUEST),
     };
-    let query = request.uri().query().unwrap_or_default();
-    let format = query.split('&').find_map(|pair| pair.strip_prefix("format=")).unwrap_or("binary");
+    let format = query_field(&request, "format").unwrap_or("binary");
     if !matches!(format, "json" | "binary") {
         let message = format!("query field format is {:?}, expected json or binary", format.chars().take(40).collect::<String>());
         return ErrorMessage::new("unknown_format", message).response(StatusCode::BAD_REQUEST);

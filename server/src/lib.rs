@@ -5,28 +5,39 @@
 
 #![forbid(unsafe_code)]
 
+mod answer;
 mod clip;
 mod config;
+mod control;
 pub mod feed;
+mod fit;
 mod http;
 #[cfg(target_os = "linux")]
 pub mod load;
 mod metrics;
+mod page;
 pub mod pipeline;
+mod profiles;
 mod publish;
 mod room;
 mod send;
 mod service;
 mod socket;
 pub mod solve;
+mod source;
 mod stream;
 mod tls;
 mod token;
+pub mod trackers;
 mod viewer;
 
 pub use clip::{Clip, ClipError, ClipReader};
 pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts, Tls};
+pub use fit::{FitCliError, Guide, LiveFit, StepAt, fit_feed, fit_live, write_profile};
+pub use profiles::ProfileError;
 pub use send::{SendError, SendOptions, SendReport, SendSource, send};
 pub use service::{ServerError, bind, load_character, run};
 pub use tls::{Identity, TlsError};
 pub use token::{Claims, Role, TokenError, make_key_file, make_token};
+pub use trackers::fake::{FakeError, FakeKind, FakeOptions, fake};
+pub use trackers::spec::{ListenSpec, RoomRule, SpecError, VmcOutSpec};

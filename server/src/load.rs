@@ -304,8 +304,17 @@ mod tests {
 
     #[test]
     fn impossible_loads_are_refused() {
-        let sound =
-            LoadOptions { viewers: 1, rooms: 1, fps: 60.0, seconds: 1.0, stalled: 0.0, reconnecting: 0.0, baseline: false, rounds: 1 };
+        let sound = LoadOptions {
+            viewers: 1,
+            rooms: 1,
+            fps: 60.0,
+            seconds: 1.0,
+            warm_up: 0.0,
+            stalled: 0.0,
+            reconnecting: 0.0,
+            baseline: false,
+            rounds: 1,
+        };
         check(&sound).unwrap();
         for wrong in [
             LoadOptions { viewers: 0, ..sound.clone() },

@@ -1,4 +1,4 @@
-//! The server's command line.
+//! The server's command line: `serve`, `send`, `fit`, `fake`, `token` and `load`.
 
 #[cfg(target_os = "linux")]
 mod load_command;
@@ -8,10 +8,13 @@ use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use rhytid_server::{
-    Access, Clip, Identity, Limits, SendOptions, SendReport, SendSource, ServerConfig, Timeouts, Tls, bind, load_character, run, send,
+    Access, Clip, FakeKind, FakeOptions, Guide, Identity, Limits, ListenSpec, LiveFit, SendOptions, SendReport, SendSource, ServerConfig,
+    StepAt, Timeouts, Tls, VmcOutSpec, bind, fake, fit_feed, fit_live, load_character, run, send, write_profile,
 };
 use rhytid_shared::trust::Trust;
-use std::io::Write;
+use rhytid_shared::{FIT_SECONDS, FitStep, Profile, ProfileChoice, RoomName, Settings};
+use std::io::{IsTerminal, Write};
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -38,6 +41,10 @@ enum Command {
     Serve(Box<ServeArgs>),
     /// Publish a feed file, or an animation clip of a character.
     Send(SendArgs),
+    /// Fit a performer: measure eight faces, from a recorded feed or live with instructions here, and write a profile.
+    Fit(FitArgs),
+    /// Play another program's tracker from a feed file, to try its protocol without it.
+    Fake(FakeArgs),
     /// Make a token, or a key that signs tokens.
     Token(token_command::TokenArgs),
     /// Measure: a server on one core, its publishers and viewers on another.
@@ -60,6 +67,18 @@ struct ServeArgs {
     /// Settings; flags given besides win.
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
+    /// A port for other programs' trackers, PROTOCOL one of any, openseeface, livelink, ifacialmocap, fmv3, vmc and vts; options
+    /// room=NAME|subject, allow=IP, phone=IP:PORT,
+    /// version=1|2|3|facemotion3d, swap_jaw=BOOL, swap_mouth=BOOL (repeat for several).
+    #[arg(long, value_name = "PROTOCOL=IP:PORT[,OPTION=VALUE…]")]
+    listen_udp: Vec<ListenSpec>,
+    /// A program that gets a room's face as VMC (repeat for several).
+    #[arg(long, value_name = "IP:PORT[,room=NAME]")]
+    vmc_out: Vec<VmcOutSpec>,
+    /// Keep performers' profiles in this folder: a fit that is given a name is written there, and a tracker gets the newest one
+    /// that was made with it.
+    #[arg(long, value_name = "DIR")]
+    profiles: Option<PathBuf>,
     #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
@@ -96,6 +115,12 @@ struct SendArgs {
     /// Take the room over from another publisher.
     #[arg(long)]
     takeover: bool,
+    /// Send frames of landmarks in the binary form, a twelfth of the bytes.
+    #[arg(long)]
+    binary: bool,
+    /// What is known of the performer: a profile's file, or the name of one that the server keeps.
+    #[arg(long, value_name = "FILE.json|NAME", value_parser = parse_profile)]
+    profile: Option<ProfileChoice>,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     #[arg(long, default_value = "15", value_name = "SECONDS", value_parser = parse_seconds)]
     timeout: Duration,
@@ -103,17 +128,98 @@ struct SendArgs {
     /// public ones
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     trust: Trust,
-    /// What lets it in, where the server wants to know; also from the environment's RHYTID_TOKEN. Others on this machine can read
-    /// the arguments of a command.
-    #[arg(long, conflicts_with = "token_file")]
-    token: Option<String>,
-    /// A file with the token.
-    #[arg(long, value_name = "FILE")]
-    token_file: Option<PathBuf>,
+    #[command(flatten)]
+    token: token_command::GivenToken,
 }
 
 fn parse_trust(text: &str) -> Result<Trust, String> {
-    if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
+    Trust::from_argument(text, |path| std::fs::read(path))
+}
+
+fn parse_profile(text: &str) -> Result<ProfileChoice, String> {
+    if let Ok(name) = RoomName::new(text) {
+        return Ok(ProfileChoice::Named(name));
+    }
+    let json = std::fs::read_to_string(text).map_err(|error| format!("cannot read it: {error}"))?;
+    Profile::from_json(&json).map(|profile| ProfileChoice::Given(Box::new(profile))).map_err(|error| error.message)
+}
+
+#[derive(Args)]
+struct FitArgs {
+    /// A recording of the eight faces; without one a live source is guided.
+    #[arg(value_name = "FEED")]
+    feed: Option<PathBuf>,
+    /// Where to write the profile.
+    #[arg(long, value_name = "FILE.json")]
+    out: PathBuf,
+    /// When the recording shows a face, seconds of the feed (repeat for each); without any, when the feed itself asks for it.
+    #[arg(long = "step", value_name = "STEP=FROM..TO", requires = "feed")]
+    steps: Vec<StepAt>,
+    /// What the profile is called; a server with --profiles keeps it by this name.
+    #[arg(long, value_parser = parse_name)]
+    name: Option<RoomName>,
+    /// The server of a live source.
+    #[arg(long, default_value = "ws://127.0.0.1:7878", value_name = "URL", conflicts_with = "feed")]
+    to: String,
+    /// Its room.
+    #[arg(long, default_value = "demo", value_parser = parse_name, conflicts_with = "feed")]
+    room: RoomName,
+    /// Its slot in the room.
+    #[arg(long, default_value = "main", value_parser = parse_name, conflicts_with = "feed")]
+    slot: RoomName,
+    /// How long to get into a face.
+    #[arg(long, default_value = "1.5", value_name = "SECONDS", value_parser = parse_seconds, conflicts_with = "feed")]
+    ready: Duration,
+    /// How long each face is measured, 0.2 to 10.
+    #[arg(long, default_value = "1.5", value_name = "SECONDS", value_parser = parse_hold, conflicts_with = "feed")]
+    hold: Duration,
+    /// Put sides right without asking.
+    #[arg(long)]
+    yes: bool,
+    /// Whom to trust on wss://, as of `send`.
+    #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
+    trust: Trust,
+    #[command(flatten)]
+    token: token_command::GivenToken,
+}
+
+fn parse_name(text: &str) -> Result<RoomName, String> {
+    RoomName::new(text).map_err(|error| error.to_string())
+}
+
+fn parse_hold(text: &str) -> Result<Duration, String> {
+    let [least, most] = FIT_SECONDS;
+    let seconds = text.parse().ok().filter(|seconds| (least..=most).contains(seconds));
+    seconds.map(Duration::from_secs_f64).ok_or_else(|| format!("expected seconds from {least} to {most}"))
+}
+
+#[derive(Args)]
+struct FakeArgs {
+    /// The feed file: weights, or landmarks, from which weights are told where the protocol has weights.
+    #[arg(value_name = "FEED")]
+    feed: PathBuf,
+    /// Whom to play.
+    #[arg(long = "as", value_name = "SENDER")]
+    kind: FakeKind,
+    /// Where to send to; without, to whoever asks for it (ifacialmocap, facemotion3d, fmv3, vts).
+    #[arg(long, value_name = "IP:PORT")]
+    to: Option<SocketAddr>,
+    /// Where to send from and to be asked at; port 0 takes a free one.
+    #[arg(long, default_value = "0.0.0.0:0", value_name = "IP:PORT")]
+    bind: SocketAddr,
+    /// What the performer is called, where the protocol says it.
+    #[arg(long, default_value = "Fake", value_parser = parse_subject)]
+    subject: String,
+    /// Feed seconds a second, or `max`.
+    #[arg(long, default_value = "1.0", value_parser = parse_speed)]
+    speed: f64,
+    /// Play it again and again.
+    #[arg(long = "loop")]
+    repeats: bool,
+}
+
+fn parse_subject(text: &str) -> Result<String, String> {
+    if text.len() <= 256 { Ok(text.to_owned()) } else { Err("expected at most 256 bytes".into()) }
 }
 
 fn parse_speed(text: &str) -> Result<f64, String> {
@@ -140,6 +246,8 @@ async fn main() -> ExitCode {
     let result = match cli.command {
         Command::Serve(args) => serve(*args, matches.subcommand_matches("serve")).await,
         Command::Send(args) => send_feed(args).await,
+        Command::Fit(args) => fit(args).await,
+        Command::Fake(args) => fake_feed(args).await,
         Command::Token(args) => token_command::token(&args),
         #[cfg(target_os = "linux")]
         Command::Load(args) => load_command::load(args).await,
@@ -200,6 +308,9 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "room-timeout": timeouts.room_idle,
     }
     config.character = args.character.or(config.character);
+    config.profiles = args.profiles.or(config.profiles);
+    config.listen_udp.extend(args.listen_udp);
+    config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);
     config.access.origins.extend(args.access.origins);
     config.access.token_key = args.access.token_key.or(config.access.token_key);
@@ -298,9 +409,11 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         speed: args.speed,
         repeats: args.repeats,
         takeover: args.takeover,
+        binary: args.binary,
+        profile: args.profile,
         timeout: args.timeout,
         trust: args.trust,
-        token: token_command::given(args.token, args.token_file.as_deref())?,
+        token: args.token.read()?,
     };
     let mut interrupt = Signals::new().context("cannot wait for signals")?;
     let report = send(&options, &progress, async move { interrupt.wait().await }).await;
@@ -308,5 +421,78 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
     let SendReport { frames, errors } = report?;
     ensure!(errors == 0, "sent {frames} frames, of all messages the server refused {errors}");
     eprintln!("sent {frames} frames, none refused");
+    Ok(())
+}
+
+async fn fit(args: FitArgs) -> anyhow::Result<()> {
+    let FitArgs { feed, out, steps, name, to, room, slot, ready, hold, yes, trust, token } = args;
+    let profile = if let Some(feed) = feed {
+        let (character, _) = load_character(None)?;
+        let report = fit_feed(&feed, &character, steps, name.as_ref(), |line| eprintln!("{line}"))?;
+        report.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
+        let mut profile = report.profile;
+        if yes {
+            profile.settings.change(&report.offers);
+        } else if report.offers != Settings::default() {
+            eprintln!("--yes puts it right in the profile");
+        }
+        profile
+    } else {
+        let (room, slot, name) = (room.to_string(), slot.to_string(), name.map(|name| name.to_string()));
+        let options = LiveFit { to, room, slot, name, ready, hold, trust, token: token.read()? };
+        fit_live(&options, &mut Terminal { yes }).await?
+    };
+    write_profile(&profile, &out).with_context(|| format!("cannot write {}", out.display()))?;
+    eprintln!("wrote {}", out.display());
+    Ok(())
+}
+
+/// Guides a performer by lines of text.
+struct Terminal {
+    yes: bool,
+}
+
+impl Guide for Terminal {
+    fn ask(&mut self, step: FitStep, at: usize, of: usize, ready: Duration, hold: Duration) {
+        let bell = if std::io::stderr().is_terminal() { "\x07" } else { "" };
+        eprintln!("{bell}[{at}/{of}] {}: in {:.1} s, for {:.1} s", step.instruction(), ready.as_secs_f64(), hold.as_secs_f64());
+    }
+
+    fn tell(&mut self, text: &str) {
+        eprintln!("      {text}");
+    }
+
+    fn agrees(&mut self, offers: &Settings) -> bool {
+        if self.yes {
+            return true;
+        }
+        let offered = serde_json::to_string(offers).unwrap_or_default();
+        if !std::io::stdin().is_terminal() {
+            eprintln!("      --yes puts it right: {offered}");
+            return false;
+        }
+        eprint!("      put it right ({offered})? [Y/n] ");
+        let mut line = String::new();
+        std::io::stdin().read_line(&mut line).is_ok() && !line.trim().to_lowercase().starts_with('n')
+    }
+}
+
+async fn fake_feed(args: FakeArgs) -> anyhow::Result<()> {
+    let options = FakeOptions {
+        kind: args.kind,
+        feed: args.feed,
+        to: args.to,
+        bind: args.bind,
+        subject: args.subject,
+        speed: args.speed,
+        repeats: args.repeats,
+    };
+    let mut interrupt = Signals::new().context("cannot wait for signals")?;
+    let tell = |address: SocketAddr| match options.to {
+        Some(to) => eprintln!("sending from udp {address} to {to}"),
+        None => eprintln!("waiting on udp {address} to be asked"),
+    };
+    let frames = fake(&options, tell, async move { interrupt.wait().await }).await?;
+    eprintln!("sent {frames} frames");
     Ok(())
 }

@@ -15,6 +15,19 @@ pub(crate) struct Reason {
     reason: &'static str,
 }
 
+/// Label of a tracker protocol.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct Spoken {
+    protocol: &'static str,
+}
+
+/// Labels of a tracker protocol's dropped datagrams and faces.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct SpokenReason {
+    protocol: &'static str,
+    reason: &'static str,
+}
+
 /// Every counter of the service.
 pub(crate) struct Metrics {
     registry: Registry,
@@ -27,6 +40,10 @@ pub(crate) struct Metrics {
     pub bytes_in: Counter,
     pub bytes_out: Counter,
     pub solve_seconds: Histogram,
+    pub vmc_frames_out: Counter,
+    tracker_datagrams: Family<Spoken, Counter>,
+    tracker_frames: Family<Spoken, Counter>,
+    tracker_dropped: Family<SpokenReason, Counter>,
     dropped: Family<Reason, Counter>,
     refused: Family<Reason, Counter>,
 }
@@ -45,6 +62,10 @@ impl Metrics {
             bytes_out: Counter::default(),
             // 2 µs to 4 ms.
             solve_seconds: Histogram::new(exponential_buckets(2e-6, 2.0, 12)),
+            vmc_frames_out: Counter::default(),
+            tracker_datagrams: Family::default(),
+            tracker_frames: Family::default(),
+            tracker_dropped: Family::default(),
             dropped: Family::default(),
             refused: Family::default(),
             registry: Registry::default(),
@@ -60,6 +81,18 @@ impl Metrics {
         registry.register_with_unit("solve", "Time to solve one frame", Unit::Seconds, metrics.solve_seconds.clone());
         registry.register("frames_dropped", "Frames that were refused, or that a slow viewer skipped, by reason", metrics.dropped.clone());
         registry.register("sessions_ended", "Sockets refused or ended by either side, by reason", metrics.refused.clone());
+        registry.register("tracker_datagrams", "Datagrams from trackers, by protocol", metrics.tracker_datagrams.clone());
+        registry.register(
+            "tracker_frames",
+            "Faces that trackers' datagrams have put into rooms, by protocol",
+            metrics.tracker_frames.clone(),
+        );
+        registry.register(
+            "tracker_dropped",
+            "Trackers' datagrams that were dropped, and faces in them, by protocol and reason",
+            metrics.tracker_dropped.clone(),
+        );
+        registry.register("vmc_frames_out", "Faces sent as VMC", metrics.vmc_frames_out.clone());
         let metrics = Self { registry, ..metrics };
         // Listed from the start, with its zero.
         metrics.drop_frames("slow_viewer", 0);
@@ -69,6 +102,21 @@ impl Metrics {
     /// Counts frames that did not go on.
     pub fn drop_frames(&self, reason: &'static str, count: u64) {
         self.dropped.get_or_create(&Reason { reason }).inc_by(count);
+    }
+
+    /// Counts a datagram of a tracker.
+    pub fn tracker_datagram(&self, protocol: &'static str) {
+        self.tracker_datagrams.get_or_create(&Spoken { protocol }).inc();
+    }
+
+    /// Counts a face that a tracker has put into a room.
+    pub fn tracker_frame(&self, protocol: &'static str) {
+        self.tracker_frames.get_or_create(&Spoken { protocol }).inc();
+    }
+
+    /// Counts a datagram of a tracker, or a face in one, that did not go on.
+    pub fn tracker_drop(&self, protocol: &'static str, reason: &'static str) {
+        self.tracker_dropped.get_or_create(&SpokenReason { protocol, reason }).inc();
     }
 
     /// Counts a socket that was refused, or ended by either side.

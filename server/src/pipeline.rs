@@ -3,7 +3,7 @@
 
 use crate::solve::{Calibration, CalibrationReport, DelayReport, SolveConfig, SolveError, Solver};
 use rhytid_shared::packet::{Encoder, PacketKind};
-use rhytid_shared::{Character, FaceFrame, PublishHello, TrackingFrame};
+use rhytid_shared::{Character, Command, FaceFrame, PublishHello, TrackingFrame};
 use std::sync::Arc;
 
 /// Solves and encodes the frames of one session.
@@ -57,14 +57,24 @@ impl Pipeline {
         Ok(())
     }
 
-    /// The second half of [`Self::frame`].
-    pub(crate) fn encode(&mut self, packet: &mut Vec<u8>) -> PacketKind {
+    /// The second half of [`Self::frame`]; in a room the room encodes.
+    fn encode(&mut self, packet: &mut Vec<u8>) -> PacketKind {
         self.encoder.encode(&self.face, packet)
     }
 
     /// Takes the neutral face now.
     pub fn calibrate(&mut self) {
         self.solver.calibrate();
+    }
+
+    /// Does what a feed's command says.
+    pub fn command(&mut self, command: &Command) -> Result<(), SolveError> {
+        self.solver.command(command)
+    }
+
+    /// The solve itself: settings, profile, fit.
+    pub(crate) fn solver(&mut self) -> &mut Solver {
+        &mut self.solver
     }
 
     /// A neutral that has been reached since the last call.

@@ -1,16 +1,15 @@
 //! One publisher: its messages are read, solved, encoded and put into its room, in the order they come.
 
+use crate::answer::Answer;
 use crate::config::seconds;
 use crate::http::Pass;
-use crate::pipeline::Pipeline;
-use crate::room::{Evicted, Publishing, RoomError};
+use crate::room::RoomError;
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
-use crate::solve::{Calibration, DelayReport, SolveError};
+use crate::source::{FrameError, OpenError, Source};
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
 use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
-use serde::Serialize;
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -18,35 +17,6 @@ use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::{Bytes, Message, Utf8Bytes};
-
-/// Answers to a publisher, besides errors.
-#[derive(Debug, Serialize)]
-#[serde(tag = "type", rename_all = "snake_case")]
-enum Answer<'a> {
-    /// The hello was taken; frames may come.
-    Ready {
-        version: u32,
-        room: &'a str,
-        /// Number of this session in its room.
-        session: u32,
-        /// True where the session starts from the neutral face that the room has kept.
-        kept_neutral: bool,
-        character: &'a str,
-        /// Names that `bones` frames may use.
-        bones: Vec<&'a str>,
-    },
-    /// A neutral face has been taken.
-    Calibrated {
-        /// Sender's time at which it was reached, seconds.
-        t: f64,
-        /// Frames it is the median of.
-        frames: usize,
-        /// True where the publisher asked for it.
-        requested: bool,
-        /// Delay the smoothing adds at present, seconds by group.
-        added_delay: DelayReport,
-    },
-}
 
 /// Buffers for messages of the configured size.
 pub(crate) fn socket_config(hub: &Hub) -> WebSocketConfig {
@@ -58,9 +28,6 @@ pub(crate) fn socket_config(hub: &Hub) -> WebSocketConfig {
         .max_message_size(Some(most))
         .max_frame_size(Some(most))
 }
-
-/// Calibrations a second from one publisher: each may solve all its frames of the last seconds anew.
-const CALIBRATIONS_PER_SECOND: u32 = 2;
 
 /// Takes a publisher's messages until one side ends it.
 pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName, pass: Pass) {
@@ -85,38 +52,19 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName, pass: &Pass) -
             Err(_) => return Err(refusal("hello_timeout", format!("no hello within {} seconds", timeouts.hello))),
         },
     };
-    // Before the room is claimed: a hello that leads to nothing takes no room from anybody.
-    let kept = hello.keep_neutral.then(|| hub.rooms.neutral(room, &hello)).flatten();
-    let (mut pipeline, has_kept) = start(hub, &hello, kept).map_err(|error| refusal("bad_hello", format!("hello: {error}")))?;
-    let (place, evicted) = claim(hub, room, &hello)?;
-    pipeline.set_session(place.session);
-    tracing::info!(%room, session = place.session, source = hello.source, takeover = hello.takeover, has_kept, "publisher ready");
+    let (source, evicted) = Source::open(hub, room, hello).map_err(not_opened)?;
     let heard = Heard::now();
-    let mut session = Session::new(hub, pass, place, pipeline, reader, hello);
-    let stop = tokio::select! {
+    let mut session = Session::new(hub, pass, source, reader);
+    Err(tokio::select! {
         biased;
         () = stopped(&mut shutdown) => Ending::shutdown().into(),
         _ = evicted => taken_over(),
         () = until(pass.expires) => Ending::token_expired().into(),
-        result = session.run(socket, &heard, has_kept) => match result { Err(stop) => stop },
+        result = session.run(socket, &heard) => match result { Err(stop) => stop },
         () = heard.silence(seconds(timeouts.publisher_idle)) => {
             refusal("idle", format!("nothing heard for {} seconds", timeouts.publisher_idle))
         }
-    };
-    // What has refined the neutral since it was told of.
-    session.keep_neutral();
-    tracing::info!(%room, session = session.place.session, frames = session.num_frames, "publisher gone");
-    Err(stop)
-}
-
-/// The session's pipeline, and whether it starts from the `kept` neutral face.
-fn start(hub: &Hub, hello: &PublishHello, kept: Option<Calibration>) -> Result<(Pipeline, bool), SolveError> {
-    let (character, config) = (&hub.character, &hub.config.solve);
-    // A neutral of weights does not fit a sender that has a layout too: its landmarks have none yet.
-    if let Some(pipeline) = kept.and_then(|kept| Pipeline::with_calibration(character.clone(), config, hello, 0, kept).ok()) {
-        return Ok((pipeline, true));
-    }
-    Ok((Pipeline::new(character.clone(), config, hello, 0)?, false))
+    })
 }
 
 /// Reads up to the hello.
@@ -125,67 +73,61 @@ async fn read_hello(hub: &Hub, socket: &mut Socket, reader: &mut PublishReader) 
     hub.metrics.bytes_in.inc_by(text.len() as u64);
     match reader.read(&text, &mut TrackingFrame::default()) {
         Ok(PublishMessage::Hello(hello)) => Ok(hello),
-        Ok(PublishMessage::Frame | PublishMessage::Calibrate) => unreachable!("the reader refuses both before a hello"),
+        Ok(_) => unreachable!("the reader refuses all else before a hello"),
         Err(MessageError { code, message }) => Err(refusal(code, message)),
     }
 }
 
-/// A publisher that has claimed its room.
+/// A publisher that has claimed its slot.
 struct Session<'a> {
     hub: &'a Hub,
     pass: &'a Pass,
-    place: Publishing,
-    pipeline: Pipeline,
+    source: Source,
     reader: PublishReader,
-    hello: PublishHello,
     frame: TrackingFrame,
-    packet: Vec<u8>,
     messages: Rate,
-    calibrations: Rate,
     /// The sender knows that it is too fast.
     has_told_rate: bool,
-    num_frames: u64,
     num_bad_in_a_row: u32,
 }
 
 impl<'a> Session<'a> {
-    fn new(hub: &'a Hub, pass: &'a Pass, place: Publishing, pipeline: Pipeline, reader: PublishReader, hello: PublishHello) -> Self {
-        let now = Instant::now();
+    fn new(hub: &'a Hub, pass: &'a Pass, source: Source, reader: PublishReader) -> Self {
         Self {
             hub,
             pass,
-            place,
-            pipeline,
+            source,
             reader,
-            hello,
             frame: TrackingFrame::default(),
-            packet: Vec::new(),
-            messages: Rate::new(hub.config.limits.frames_per_second, now),
-            calibrations: Rate::new(CALIBRATIONS_PER_SECOND, now),
+            messages: Rate::new(hub.config.limits.frames_per_second, Instant::now()),
             has_told_rate: false,
-            num_frames: 0,
             num_bad_in_a_row: 0,
         }
     }
 
     /// Says that it is ready and takes messages until the session ends. May be dropped at any await.
-    async fn run(&mut self, socket: &mut Socket, heard: &Heard, kept_neutral: bool) -> Result<Infallible, Stop> {
+    async fn run(&mut self, socket: &mut Socket, heard: &Heard) -> Result<Infallible, Stop> {
         let character = &self.hub.character;
         let ready = Answer::Ready {
             version: PROTOCOL_VERSION,
-            room: self.place.room.name.as_str(),
-            session: self.place.session,
-            kept_neutral,
+            room: self.source.room().as_str(),
+            session: self.source.session(),
+            kept_neutral: self.source.kept_neutral,
             character: &character.name,
             bones: character.bones.iter().map(|bone| bone.name.as_str()).collect(),
+            profile: self.source.profile_name(),
         };
         let timeouts = &self.hub.config.timeouts;
         let (ping, write) = (seconds(timeouts.ping), seconds(timeouts.write));
-        send_json(socket, &ready, write).await?;
+        send(socket, Message::Text(ready.text()), write).await?;
         let mut last_ping = Instant::now();
         loop {
             let message = tokio::select! {
                 message = socket.next() => message,
+                control = self.source.next_control() => {
+                    self.source.control(control);
+                    continue;
+                }
                 () = tokio::time::sleep_until(last_ping + ping) => {
                     last_ping = Instant::now();
                     send(socket, Message::Ping(Bytes::new()), write).await?;
@@ -196,11 +138,13 @@ impl<'a> Session<'a> {
             match message {
                 Some(Ok(Message::Text(text))) => {
                     self.hub.metrics.bytes_in.inc_by(text.len() as u64);
-                    self.take(socket, &text).await?;
+                    let message = self.reader.read(&text, &mut self.frame);
+                    self.take(socket, message).await?;
                 }
                 Some(Ok(Message::Binary(bytes))) => {
                     self.hub.metrics.bytes_in.inc_by(bytes.len() as u64);
-                    self.refuse(socket, ErrorMessage::new("binary_message", BINARY)).await?;
+                    let message = self.reader.read_binary(&bytes, &mut self.frame);
+                    self.take(socket, message).await?;
                 }
                 Some(Ok(Message::Close(_))) | None => return Err(Stop::Gone("closed")),
                 Some(Ok(_)) => {}
@@ -210,53 +154,33 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Takes one text message.
-    async fn take(&mut self, socket: &mut Socket, text: &str) -> Result<(), Stop> {
-        match self.reader.read(text, &mut self.frame) {
-            Ok(PublishMessage::Calibrate) => {
-                if self.calibrations.take_if_free(Instant::now()) {
-                    self.pipeline.calibrate();
-                } else {
-                    let message = format!("more than {CALIBRATIONS_PER_SECOND} calibrations a second: this one is left out");
-                    return self.refuse(socket, ErrorMessage::new("too_many_calibrations", message)).await;
-                }
-            }
+    /// Takes one message as it was read.
+    async fn take(&mut self, socket: &mut Socket, message: Result<PublishMessage, MessageError>) -> Result<(), Stop> {
+        match message {
+            Ok(PublishMessage::Command(command)) => match self.source.command(command) {
+                Ok(Some(answer)) => send(socket, Message::Text(answer), seconds(self.hub.config.timeouts.write)).await?,
+                Ok(None) => {}
+                Err(error) => return self.refuse(socket, error).await,
+            },
             Ok(PublishMessage::Hello(_)) => unreachable!("the reader refuses a second hello"),
-            Ok(PublishMessage::Frame) => {
-                let start = std::time::Instant::now();
-                if let Err(error) = self.pipeline.solve(&self.frame) {
+            Ok(PublishMessage::Frame) => match self.source.frame(self.hub, &self.frame) {
+                Ok(()) => self.num_bad_in_a_row = 0,
+                Err(FrameError::Evicted) => return Err(taken_over()),
+                Err(FrameError::Bad(error)) => {
                     self.reader.take_back();
                     return self.refuse(socket, ErrorMessage::new("bad_frame", error.to_string())).await;
                 }
-                self.hub.metrics.solve_seconds.observe(start.elapsed().as_secs_f64());
-                let kind = self.pipeline.encode(&mut self.packet);
-                if !self.place.publish(kind, &self.packet, self.pipeline.face()) {
-                    return Err(taken_over());
-                }
-                self.hub.metrics.frames_in.inc();
-                self.num_frames += 1;
-                self.num_bad_in_a_row = 0;
-            }
+            },
             Err(error) => return self.refuse(socket, ErrorMessage::new(error.code, error.message)).await,
         }
-        if let Some(report) = self.pipeline.take_calibrated() {
-            self.keep_neutral();
-            let answer = Answer::Calibrated {
-                t: report.t,
-                frames: report.num_frames,
-                requested: report.requested,
-                added_delay: self.pipeline.added_delay(),
-            };
-            send_json(socket, &answer, seconds(self.hub.config.timeouts.write)).await?;
+        for told in self.source.news() {
+            match told {
+                Ok(text) => send(socket, Message::Text(text), seconds(self.hub.config.timeouts.write)).await?,
+                // The step is to be made again; no message was bad.
+                Err(error) => send_json(socket, &error, seconds(self.hub.config.timeouts.write)).await?,
+            }
         }
         Ok(())
-    }
-
-    /// Leaves the neutral in use with the room.
-    fn keep_neutral(&self) {
-        if let Some(calibration) = self.pipeline.calibration() {
-            self.place.keep_neutral(&self.hello, calibration);
-        }
     }
 
     /// Slows a sender that is too fast, whatever it sends: nothing is read meanwhile, so its own socket fills up. Its frames
@@ -281,7 +205,7 @@ impl<'a> Session<'a> {
     async fn refuse(&mut self, socket: &mut Socket, error: ErrorMessage) -> Result<(), Stop> {
         self.hub.metrics.drop_frames(error.code, 1);
         self.num_bad_in_a_row += 1;
-        tracing::debug!(room = %self.place.room.name, code = error.code, message = error.message, "bad message from publisher");
+        tracing::debug!(room = %self.source.room(), code = error.code, message = error.message, "bad message from publisher");
         send_json(socket, &error, seconds(self.hub.config.timeouts.write)).await?;
         let most = self.hub.config.limits.bad_frames_in_a_row;
         if self.num_bad_in_a_row >= most {
@@ -291,7 +215,7 @@ impl<'a> Session<'a> {
     }
 }
 
-const BINARY: &str = "message is binary, expected JSON text";
+const BINARY: &str = "the first message is binary, expected the hello as JSON text";
 
 /// The first text message.
 async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<Utf8Bytes, Stop> {
@@ -308,14 +232,19 @@ async fn first_text(socket: &mut Socket, hub: &Hub) -> Result<Utf8Bytes, Stop> {
     }
 }
 
-fn claim(hub: &Hub, room: &RoomName, hello: &PublishHello) -> Result<(Publishing, Evicted), Stop> {
-    hub.rooms.claim(room, &hello.source, hello.takeover).map_err(|error| {
-        let code = match error {
-            RoomError::Taken => CloseCode::Policy,
-            RoomError::TooManyRooms { .. } | RoomError::TooManyViewers { .. } => CloseCode::Again,
-        };
-        Ending::error(code, ErrorMessage::new(error.code(), error.to_string())).into()
-    })
+/// The end of a publisher that could not enter its room.
+fn not_opened(error: OpenError) -> Stop {
+    match error {
+        OpenError::Hello(_) => refusal("bad_hello", error.to_string()),
+        OpenError::Profile(_) => refusal("unknown_profile", error.to_string()),
+        OpenError::Room(refused) => {
+            let code = match refused {
+                RoomError::Taken | RoomError::SlotTaken => CloseCode::Policy,
+                RoomError::TooManyRooms { .. } | RoomError::TooManyViewers { .. } | RoomError::TooManySlots { .. } => CloseCode::Again,
+            };
+            Ending::error(code, ErrorMessage::new(refused.code(), refused.to_string())).into()
+        }
+    }
 }
 
 /// The end of a publisher that does not keep the rules.
@@ -324,7 +253,7 @@ fn refusal(code: &'static str, message: String) -> Stop {
 }
 
 /// Done at `end`, where there is one.
-async fn until(end: Option<Instant>) {
+pub(crate) async fn until(end: Option<Instant>) {
     match end {
         Some(end) => tokio::time::sleep_until(end).await,
         None => std::future::pending().await,
@@ -360,7 +289,7 @@ impl Heard {
 }
 
 /// So many a second, with a burst of a tenth of a second or of two.
-struct Rate {
+pub(crate) struct Rate {
     interval: Duration,
     burst: Duration,
     /// When what came so far would have come at the allowed rate.
@@ -368,7 +297,7 @@ struct Rate {
 }
 
 impl Rate {
-    fn new(per_second: u32, now: Instant) -> Self {
+    pub fn new(per_second: u32, now: Instant) -> Self {
         let interval = Duration::from_secs(1) / per_second;
         let burst = (interval * 2).max(Duration::from_millis(100));
         Self { interval, burst, due: now.checked_sub(burst).unwrap_or(now) }
@@ -382,7 +311,7 @@ impl Rate {
     }
 
     /// Counts one where the rate allows it now.
-    fn take_if_free(&mut self, now: Instant) -> bool {
+    pub fn take_if_free(&mut self, now: Instant) -> bool {
         let is_free = self.due <= now;
         if is_free {
             self.take(now);

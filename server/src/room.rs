@@ -2,14 +2,16 @@
 
 use crate::metrics::Metrics;
 use crate::solve::Calibration;
-use rhytid_shared::packet::{Decoder, PacketKind, PacketLayout};
+use crate::solve::mix::Mixer;
+use crate::source::Control;
+use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
-use rhytid_shared::{FaceFrame, PublishHello, RoomName};
+use rhytid_shared::{ChannelGroup, Character, FaceFrame, PublishHello, RoomName, Slot};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
-use tokio::sync::{oneshot, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_tungstenite::tungstenite::{Bytes, Utf8Bytes};
 
 /// The newest state of a room, shared by all its viewers.
@@ -53,6 +55,10 @@ pub(crate) enum RoomError {
     TooManyViewers { most: usize },
     #[error("the room has a publisher already; say \"takeover\":true in the hello to take its place")]
     Taken,
+    #[error("the slot has a publisher already; say \"takeover\":true in the hello to take its place")]
+    SlotTaken,
+    #[error("the room has {most} sources already, which is the limit")]
+    TooManySlots { most: usize },
 }
 
 impl RoomError {
@@ -62,12 +68,36 @@ impl RoomError {
             Self::TooManyRooms { .. } => "too_many_rooms",
             Self::TooManyViewers { .. } => "too_many_viewers",
             Self::Taken => "room_taken",
+            Self::SlotTaken => "slot_taken",
+            Self::TooManySlots { .. } => "too_many_slots",
         }
+    }
+}
+
+/// Sources in one room: a phone, a webcam, an animator's hand for each group, and some.
+pub(crate) const MAX_SLOTS: usize = 8;
+
+/// What a source asks a room for: the same for every protocol that brings frames.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(crate) struct SlotClaim {
+    /// Name, priority and groups.
+    pub slot: Slot,
+    /// What the sender calls itself.
+    pub source: String,
+    /// Take the slot over from another publisher.
+    pub takeover: bool,
+}
+
+impl SlotClaim {
+    /// As a hello says it.
+    pub fn of(hello: &PublishHello) -> Self {
+        Self { slot: hello.slot.clone(), source: hello.source.clone(), takeover: hello.takeover }
     }
 }
 
 /// All rooms.
 pub(crate) struct Rooms {
+    character: Arc<Character>,
     by_name: Mutex<BTreeMap<RoomName, Arc<Room>>>,
     max_rooms: usize,
     max_viewers: usize,
@@ -79,19 +109,29 @@ pub(crate) struct Room {
     pub name: RoomName,
     slot: watch::Sender<Option<Arc<Latest>>>,
     state: Mutex<RoomState>,
+    /// The mixer's clock counts from here.
+    since: Instant,
+    layout: PacketLayout,
     metrics: Arc<Metrics>,
 }
 
 struct RoomState {
-    publisher: Option<Publisher>,
-    /// Publishers so far.
+    /// One a slot, at most [`MAX_SLOTS`].
+    publishers: Vec<Publisher>,
+    mixer: Mixer,
+    encoder: Encoder,
+    packet: Vec<u8>,
+    /// The session that the encoder encodes.
+    encoded_session: u32,
+    /// Sessions so far: publishers, and hand-overs of the lead between them.
     num_sessions: u32,
     num_viewers: usize,
     num_states: u64,
     key: Option<Arc<KeyPacket>>,
     /// What the listing shows of the newest frame.
     shown: Option<(u32, u64, bool)>,
-    neutral: Option<Neutral>,
+    /// By slot, at most [`MAX_SLOTS`].
+    neutrals: BTreeMap<String, Neutral>,
     empty_since: Instant,
 }
 
@@ -105,9 +145,10 @@ struct Neutral {
 
 struct Publisher {
     session: u32,
-    source: String,
+    claim: SlotClaim,
     since: Instant,
     evict: oneshot::Sender<()>,
+    controls: mpsc::Sender<Control>,
 }
 
 /// A room as `/api/rooms` lists it.
@@ -117,7 +158,9 @@ pub(crate) struct RoomListing {
     viewers: usize,
     /// Publishers the room has had.
     session: u32,
+    /// The one of the highest priority.
     publisher: Option<PublisherListing>,
+    sources: Vec<SourceListing>,
     frame: Option<FrameListing>,
     /// The neutral face that the room keeps.
     neutral: Option<NeutralListing>,
@@ -126,6 +169,19 @@ pub(crate) struct RoomListing {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct PublisherListing {
     source: String,
+    seconds: f64,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct SourceListing {
+    slot: String,
+    source: String,
+    priority: u8,
+    groups: Vec<&'static str>,
+    /// It has shown a face in the last half second.
+    live: bool,
+    /// The groups it drives now.
+    drives: Vec<&'static str>,
     seconds: f64,
 }
 
@@ -153,8 +209,8 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Rooms {
-    pub fn new(max_rooms: usize, max_viewers: usize, metrics: Arc<Metrics>) -> Self {
-        Self { by_name: Mutex::default(), max_rooms, max_viewers, metrics }
+    pub fn new(character: Arc<Character>, max_rooms: usize, max_viewers: usize, metrics: Arc<Metrics>) -> Self {
+        Self { character, by_name: Mutex::default(), max_rooms, max_viewers, metrics }
     }
 
     /// Enters a room as a viewer; the room is made where there is none.
@@ -171,19 +227,29 @@ impl Rooms {
         Ok(Viewing { slot: room.slot.subscribe(), room })
     }
 
-    /// Enters a room as its publisher, in place of another one where `takeover` says so. What comes with the place says when
-    /// another takes it.
-    pub fn claim(&self, name: &RoomName, source: &str, takeover: bool) -> Result<(Publishing, Evicted), RoomError> {
+    /// Enters a room as a source, in place of the one in its slot where the claim says so. What comes with the place says when
+    /// another takes it; others reach it through `controls`.
+    pub fn claim(&self, name: &RoomName, claim: SlotClaim, controls: mpsc::Sender<Control>) -> Result<(Publishing, Evicted), RoomError> {
         let mut by_name = lock(&self.by_name);
         let room = self.find_or_make(&mut by_name, name)?;
         let mut state = lock(&room.state);
-        if state.publisher.is_some() && !takeover {
-            return Err(RoomError::Taken);
+        let before = state.publishers.iter().position(|publisher| publisher.claim.slot.name == claim.slot.name);
+        match before {
+            Some(_) if !claim.takeover => {
+                return Err(if claim.slot.name == Slot::MAIN { RoomError::Taken } else { RoomError::SlotTaken });
+            }
+            None if state.publishers.len() >= MAX_SLOTS => return Err(RoomError::TooManySlots { most: MAX_SLOTS }),
+            _ => {}
         }
         let (evict, evicted) = oneshot::channel();
         state.num_sessions = state.num_sessions.wrapping_add(1).max(1);
         let session = state.num_sessions;
-        let before = state.publisher.replace(Publisher { session, source: source.to_owned(), since: Instant::now(), evict });
+        let before = before.map(|at| state.publishers.remove(at));
+        if let Some(before) = &before {
+            state.mixer.leave(before.session);
+        }
+        state.mixer.enter(session, &claim.slot);
+        state.publishers.push(Publisher { session, claim, since: Instant::now(), evict, controls });
         drop(state);
         if let Some(before) = before {
             // Its task may have ended in this moment; then nobody needs to be told.
@@ -201,19 +267,26 @@ impl Rooms {
         if by_name.len() >= self.max_rooms {
             return Err(RoomError::TooManyRooms { most: self.max_rooms });
         }
+        let layout = PacketLayout::from(&*self.character);
         let room = Arc::new(Room {
+            since: Instant::now(),
             name: name.clone(),
             slot: watch::Sender::new(None),
             state: Mutex::new(RoomState {
-                publisher: None,
+                publishers: Vec::new(),
+                mixer: Mixer::new(self.character.clone()),
+                encoder: Encoder::new(layout.clone()),
+                packet: Vec::new(),
+                encoded_session: 0,
                 num_sessions: 0,
                 num_viewers: 0,
                 num_states: 0,
                 key: None,
                 shown: None,
-                neutral: None,
+                neutrals: BTreeMap::new(),
                 empty_since: Instant::now(),
             }),
+            layout,
             metrics: self.metrics.clone(),
         });
         by_name.insert(name.clone(), room.clone());
@@ -221,11 +294,16 @@ impl Rooms {
         Ok(room)
     }
 
-    /// The neutral face that the room keeps of the tracker of `hello`.
+    /// The room of this name.
+    pub fn find(&self, name: &RoomName) -> Option<Arc<Room>> {
+        lock(&self.by_name).get(name).cloned()
+    }
+
+    /// The neutral face that the room keeps, for the slot of `hello`, of its tracker.
     pub fn neutral(&self, name: &RoomName, hello: &PublishHello) -> Option<Calibration> {
-        let room = lock(&self.by_name).get(name).cloned()?;
+        let room = self.find(name)?;
         let state = lock(&room.state);
-        state.neutral.as_ref().filter(|kept| kept.hello.is_of_same_tracker(hello)).map(|kept| kept.calibration.clone())
+        state.neutrals.get(&hello.slot.name).filter(|kept| kept.hello.is_of_same_tracker(hello)).map(|kept| kept.calibration.clone())
     }
 
     /// Removes rooms that have been without publisher and viewers for `idle`.
@@ -233,7 +311,7 @@ impl Rooms {
         let mut by_name = lock(&self.by_name);
         by_name.retain(|_, room| {
             let state = lock(&room.state);
-            state.publisher.is_some() || state.num_viewers > 0 || state.empty_since.elapsed() < idle
+            !state.publishers.is_empty() || state.num_viewers > 0 || state.empty_since.elapsed() < idle
         });
         self.metrics.rooms.set(by_name.len() as i64);
     }
@@ -253,18 +331,48 @@ impl Rooms {
 }
 
 impl Room {
+    /// Seconds on the mixer's clock.
+    fn now(&self) -> f64 {
+        self.since.elapsed().as_secs_f64()
+    }
+
+    /// Where commands to the source in this slot go.
+    pub fn controls(&self, slot: &str) -> Option<mpsc::Sender<Control>> {
+        let state = lock(&self.state);
+        state.publishers.iter().find(|publisher| publisher.claim.slot.name == slot).map(|publisher| publisher.controls.clone())
+    }
+
     fn listing(&self) -> RoomListing {
         let state = lock(&self.state);
+        let now = self.now();
+        let first = state.publishers.iter().max_by_key(|publisher| (publisher.claim.slot.priority, publisher.session));
+        let newest_neutral = state.neutrals.values().max_by_key(|neutral| neutral.session);
         RoomListing {
             name: self.name.to_string(),
             viewers: state.num_viewers,
             session: state.num_sessions,
-            publisher: state
-                .publisher
-                .as_ref()
-                .map(|publisher| PublisherListing { source: publisher.source.clone(), seconds: publisher.since.elapsed().as_secs_f64() }),
+            publisher: first.map(|publisher| PublisherListing {
+                source: publisher.claim.source.clone(),
+                seconds: publisher.since.elapsed().as_secs_f64(),
+            }),
+            sources: state
+                .publishers
+                .iter()
+                .map(|Publisher { session, claim, since, .. }| {
+                    let (live, drives) = state.mixer.state_of(*session, now);
+                    SourceListing {
+                        slot: claim.slot.name.clone(),
+                        source: claim.source.clone(),
+                        priority: claim.slot.priority,
+                        groups: claim.slot.groups.iter().map(ChannelGroup::name).collect(),
+                        live,
+                        drives: drives.iter().map(ChannelGroup::name).collect(),
+                        seconds: since.elapsed().as_secs_f64(),
+                    }
+                })
+                .collect(),
             frame: state.shown.map(|(seq, micros, face)| FrameListing { seq, t: micros as f64 / 1e6, face }),
-            neutral: state.neutral.as_ref().map(|Neutral { session, calibration, .. }| NeutralListing {
+            neutral: newest_neutral.map(|Neutral { session, calibration, .. }| NeutralListing {
                 session: *session,
                 t: calibration.t,
                 num_frames: calibration.num_frames,
@@ -301,40 +409,59 @@ pub(crate) struct Publishing {
 pub(crate) type Evicted = oneshot::Receiver<()>;
 
 impl Publishing {
-    /// Makes `packet` the room's newest state. False where another publisher has the room.
-    pub fn publish(&self, kind: PacketKind, packet: &[u8], face: &FaceFrame) -> bool {
-        let mut state = lock(&self.room.state);
-        if state.publisher.as_ref().is_none_or(|publisher| publisher.session != self.session) {
+    /// Takes the source's newest face; where the source leads, the merged face becomes the room's newest state. False where another
+    /// publisher has the slot.
+    pub fn publish(&self, face: &FaceFrame) -> bool {
+        let mut guard = lock(&self.room.state);
+        let state = &mut *guard;
+        if state.publishers.iter().all(|publisher| publisher.session != self.session) {
             return false;
         }
+        let Some(merged) = state.mixer.take(self.session, face, self.room.now(), &mut state.num_sessions) else { return true };
+        if merged.session != state.encoded_session {
+            // A session's packets depend on its frames alone.
+            state.encoder = Encoder::new(self.room.layout.clone());
+            state.encoded_session = merged.session;
+        }
+        let kind = state.encoder.encode(merged, &mut state.packet);
         state.num_states += 1;
         let index = state.num_states;
-        let bytes = Bytes::copy_from_slice(packet);
+        let bytes = Bytes::copy_from_slice(&state.packet);
         let (key, delta) = match (kind, &state.key) {
             (PacketKind::Delta, Some(key)) => (key.clone(), Some(bytes)),
             _ => (Arc::new(KeyPacket { index, bytes }), None),
         };
         state.key = Some(key.clone());
-        state.shown = Some((face.seq, face.captured_at_micros, face.face));
+        state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
         // Under the lock, so that states stand in the slot in their order.
         self.room.slot.send_replace(Some(Arc::new(Latest { index, key, delta, json: OnceLock::new() })));
         true
     }
 
-    /// Makes `calibration` the neutral face that the room keeps, unless a later session has left one or it is kept already.
+    /// Makes `calibration` the neutral face that the room keeps for the slot of `hello`, unless a later session has left one or it
+    /// is kept already.
     pub fn keep_neutral(&self, hello: &PublishHello, calibration: &Calibration) {
         let mut state = lock(&self.room.state);
-        if state.neutral.as_ref().is_none_or(|kept| kept.session <= self.session && kept.calibration != *calibration) {
-            state.neutral = Some(Neutral { session: self.session, hello: hello.clone(), calibration: calibration.clone() });
+        let neutrals = &mut state.neutrals;
+        let slot = &hello.slot.name;
+        let kept = neutrals.get(slot);
+        if kept.is_none() && neutrals.len() >= MAX_SLOTS {
+            // Slots come and go under any names: the oldest neutral makes room.
+            let oldest = neutrals.iter().min_by_key(|(_, neutral)| neutral.session).map(|(slot, _)| slot.clone());
+            oldest.map(|oldest| neutrals.remove(&oldest));
+        } else if kept.is_some_and(|kept| kept.session > self.session || kept.calibration == *calibration) {
+            return;
         }
+        neutrals.insert(slot.clone(), Neutral { session: self.session, hello: hello.clone(), calibration: calibration.clone() });
     }
 }
 
 impl Drop for Publishing {
     fn drop(&mut self) {
         let mut state = lock(&self.room.state);
-        if state.publisher.as_ref().is_some_and(|publisher| publisher.session == self.session) {
-            state.publisher = None;
+        if let Some(at) = state.publishers.iter().position(|publisher| publisher.session == self.session) {
+            state.publishers.remove(at);
+            state.mixer.leave(self.session);
             state.empty_since = Instant::now();
             self.room.metrics.publishers.dec();
         }
@@ -346,7 +473,40 @@ mod tests {
     use super::*;
 
     fn rooms(max_rooms: usize, max_viewers: usize) -> Rooms {
-        Rooms::new(max_rooms, max_viewers, Arc::new(Metrics::new()))
+        let character = Arc::new(Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap());
+        Rooms::new(character, max_rooms, max_viewers, Arc::new(Metrics::new()))
+    }
+
+    /// Claims a slot that nobody commands.
+    fn claim(rooms: &Rooms, name: &RoomName, claim: SlotClaim) -> Result<(Publishing, Evicted), RoomError> {
+        rooms.claim(name, claim, mpsc::channel(1).0)
+    }
+
+    fn main(source: &str, takeover: bool) -> SlotClaim {
+        SlotClaim { source: source.into(), takeover, ..SlotClaim::default() }
+    }
+
+    fn slot(name: &str, takeover: bool) -> SlotClaim {
+        SlotClaim { slot: Slot { name: name.into(), ..Slot::default() }, ..main(name, takeover) }
+    }
+
+    #[test]
+    fn slots_are_taken_one_by_one() {
+        let rooms = rooms(10, 10);
+        let room = name("a");
+        let mut places: Vec<_> = (0..MAX_SLOTS).map(|i| claim(&rooms, &room, slot(&format!("s{i}"), false)).unwrap()).collect();
+        assert_eq!(claim(&rooms, &room, slot("more", false)).err(), Some(RoomError::TooManySlots { most: 8 }));
+        assert_eq!(claim(&rooms, &room, slot("s3", false)).err(), Some(RoomError::SlotTaken));
+        let again = claim(&rooms, &room, slot("s3", true)).unwrap();
+        assert_eq!(places[3].1.try_recv(), Ok(()), "it is told");
+        assert!(places[2].1.try_recv().is_err(), "and nobody else");
+        assert_eq!(rooms.metrics.publishers.get(), 8);
+        let face = FaceFrame::at_rest(&rooms.character);
+        assert!(again.0.publish(&face) && !places[3].0.publish(&face));
+        let listed = serde_json::to_value(rooms.list()).unwrap();
+        assert_eq!((listed[0]["sources"].as_array().unwrap().len(), &listed[0]["publisher"]["source"]), (8, &"s3".into()));
+        drop((places, again));
+        assert_eq!(rooms.metrics.publishers.get(), 0);
     }
 
     fn name(text: &str) -> RoomName {
@@ -356,16 +516,35 @@ mod tests {
     #[test]
     fn a_room_has_one_publisher_and_takeover_replaces_it() {
         let rooms = rooms(10, 10);
-        let (first, mut evicted) = rooms.claim(&name("a"), "one", false).unwrap();
-        assert_eq!(rooms.claim(&name("a"), "two", false).err(), Some(RoomError::Taken));
-        let (second, _evicted) = rooms.claim(&name("a"), "two", true).unwrap();
+        let (first, mut evicted) = claim(&rooms, &name("a"), main("one", false)).unwrap();
+        assert_eq!(claim(&rooms, &name("a"), main("two", false)).err(), Some(RoomError::Taken));
+        let (second, _evicted) = claim(&rooms, &name("a"), main("two", true)).unwrap();
         assert_eq!((first.session, second.session), (1, 2));
         assert_eq!(evicted.try_recv(), Ok(()));
         drop(first);
-        assert_eq!(rooms.claim(&name("a"), "three", false).err(), Some(RoomError::Taken), "the old one's end frees nothing");
+        assert_eq!(claim(&rooms, &name("a"), main("three", false)).err(), Some(RoomError::Taken), "the old one's end frees nothing");
         drop(second);
-        assert_eq!(rooms.claim(&name("a"), "three", false).unwrap().0.session, 3);
+        assert_eq!(claim(&rooms, &name("a"), main("three", false)).unwrap().0.session, 3);
         assert_eq!(rooms.metrics.publishers.get(), 0);
+    }
+
+    #[test]
+    fn a_room_of_one_source_has_the_packets_of_its_pipeline() {
+        use crate::pipeline::Pipeline;
+        use crate::solve::SolveConfig;
+        let rooms = rooms(1, 1);
+        let text = include_str!("../../shared/assets/demo.ibug68.jsonl");
+        let mut feed = crate::feed::Feed::new(std::io::Cursor::new(text), "demo".into(), &rooms.character).unwrap();
+        let (place, _evicted) = claim(&rooms, &name("a"), SlotClaim::of(&feed.hello)).unwrap();
+        let mut pipeline = Pipeline::new(rooms.character.clone(), &SolveConfig::default(), &feed.hello, place.session).unwrap();
+        let (mut frame, mut packet) = (rhytid_shared::TrackingFrame::default(), Vec::new());
+        for _ in 0..120 {
+            feed.next_frame(&mut frame).unwrap();
+            pipeline.frame(&frame, &mut packet).unwrap();
+            assert!(place.publish(pipeline.face()));
+            let latest = place.room.slot.borrow().clone().unwrap();
+            assert_eq!(latest.delta.as_ref().unwrap_or(&latest.key.bytes)[..], packet[..]);
+        }
     }
 
     #[test]
@@ -373,7 +552,7 @@ mod tests {
         let rooms = rooms(2, 1);
         let viewer = rooms.join(&name("a")).unwrap();
         assert_eq!(rooms.join(&name("a")).err(), Some(RoomError::TooManyViewers { most: 1 }));
-        let publisher = rooms.claim(&name("b"), "", false).unwrap();
+        let publisher = claim(&rooms, &name("b"), main("", false)).unwrap();
         assert_eq!(rooms.join(&name("c")).err(), Some(RoomError::TooManyRooms { most: 2 }));
         rooms.sweep(Duration::ZERO);
         assert_eq!((rooms.list().len(), rooms.metrics.rooms.get(), rooms.metrics.viewers.get()), (2, 2, 1));

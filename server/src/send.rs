@@ -5,12 +5,12 @@ use crate::feed::{Feed, FeedError, FeedItem};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use indicatif::ProgressBar;
-use rhytid_shared::TrackingFrame;
 use rhytid_shared::trust::Trust;
 use rhytid_shared::view::SUBPROTOCOL;
+use rhytid_shared::{ProfileChoice, TrackingData, TrackingFrame, encode_landmarks};
 use serde::Deserialize;
 use std::future::Future;
-use std::io::{BufRead, BufReader, Cursor};
+use std::io::{BufRead, Cursor};
 use std::path::PathBuf;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -77,6 +77,10 @@ pub struct SendOptions {
     pub repeats: bool,
     /// Take the room over from another publisher.
     pub takeover: bool,
+    /// Send frames of landmarks in the binary form, a twelfth of the bytes; what it has no room for stays JSON.
+    pub binary: bool,
+    /// What is known of the performer, in place of what the feed's hello says.
+    pub profile: Option<ProfileChoice>,
     /// How long the server may take to accept the connection, to answer the hello, and to read a message.
     pub timeout: Duration,
     /// Whom to trust where `to` is `wss://`.
@@ -105,7 +109,7 @@ pub async fn send(options: &SendOptions, progress: &ProgressBar, stop: impl Futu
                 if let Ok(file) = std::fs::metadata(path) {
                     progress.set_length(file.len());
                 }
-                let feed: Feed<BufReader<std::fs::File>> = Feed::open_for_any_character(path)?;
+                let feed = Feed::open_for_any_character(path)?;
                 send_once(feed, options, progress, &mut report, stop.as_mut()).await?
             }
             SendSource::Text(text, name) => {
@@ -152,7 +156,7 @@ enum Answer {
     Unknown,
 }
 
-type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
+pub(crate) type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 type Sink = SplitSink<Socket, Message>;
 type Answers = SplitStream<Socket>;
 
@@ -163,9 +167,10 @@ async fn send_once<R: BufRead>(
     report: &mut SendReport,
     mut stop: Pin<&mut impl Future<Output = ()>>,
 ) -> Result<Ending, SendError> {
+    let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
     let connected = tokio::select! {
         () = stop.as_mut() => return Ok(Ending::Stopped),
-        connected = connect(options) => connected?,
+        connected = connect(url, &options.trust, options.token.as_deref(), options.timeout) => connected?,
     };
     let (mut sink, answers) = connected.split();
     let (ready, is_ready) = oneshot::channel();
@@ -211,13 +216,12 @@ async fn send_once<R: BufRead>(
     }
 }
 
-/// Connects to the room's publish socket.
-async fn connect(options: &SendOptions) -> Result<Socket, SendError> {
-    let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
+/// Opens a WebSocket of the server's.
+pub(crate) async fn connect(url: String, trust: &Trust, token: Option<&str>, timeout: Duration) -> Result<Socket, SendError> {
     let connecting = async {
         let mut request = url.as_str().into_client_request()?;
         request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
-        if let Some(token) = &options.token {
+        if let Some(token) = token {
             if !may_carry_secrets(request.uri()) {
                 return Err(tungstenite::Error::Io(std::io::Error::other(
                     "a token goes over wss:// only, or to this machine: others on the way could read it",
@@ -228,13 +232,13 @@ async fn connect(options: &SendOptions) -> Result<Socket, SendError> {
             value.set_sensitive(true);
             request.headers_mut().insert(header::AUTHORIZATION, value);
         }
-        let config = options.trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
+        let config = trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
         connect_async_tls_with_config(request, None, false, Some(Connector::Rustls(config))).await
     };
-    let problem = match tokio::time::timeout(options.timeout, connecting).await {
+    let problem = match tokio::time::timeout(timeout, connecting).await {
         Ok(Ok((socket, _))) => return Ok(socket),
         Ok(Err(error)) => explain(error),
-        Err(_) => format!("no answer within {} s", options.timeout.as_secs_f64()),
+        Err(_) => format!("no answer within {} s", timeout.as_secs_f64()),
     };
     Err(SendError::Connect { url, problem })
 }
@@ -266,12 +270,12 @@ async fn publish<R: BufRead>(
     report: &mut SendReport,
 ) -> Result<(), Unsent> {
     let within = |what: &str| Unsent::Stuck(format!("{what} within {} s", options.timeout.as_secs_f64()));
-    let mut write = async |text: String| match tokio::time::timeout(options.timeout, sink.send(Message::text(text))).await {
+    let mut write = async |message: Message| match tokio::time::timeout(options.timeout, sink.send(message)).await {
         Ok(Ok(())) => Ok(()),
         Ok(Err(_)) => Err(Unsent::Lost),
         Err(_) => Err(within("it read nothing")),
     };
-    write(hello(feed.text(), options.takeover)).await?;
+    write(Message::text(hello(feed.text(), options))).await?;
     // An error means that the listening has ended, which is told there.
     if tokio::time::timeout(options.timeout, is_ready).await.map_err(|_| within("no answer to the hello"))?.is_err() {
         return Err(Unsent::Lost);
@@ -288,10 +292,23 @@ async fn publish<R: BufRead>(
             }
             report.frames += 1;
         }
-        write(feed.text().to_owned()).await?;
+        let binary = if options.binary && item == FeedItem::Frame { binary_form(&frame, feed.text()) } else { None };
+        write(binary.unwrap_or_else(|| Message::text(feed.text()))).await?;
         progress.inc(feed.text().len() as u64 + 1);
     }
     Ok(())
+}
+
+/// A frame of landmarks in the binary form; `None` for what stays JSON: other frames, and those that also give expressions,
+/// which a sender's reader leaves out.
+fn binary_form(frame: &TrackingFrame, text: &str) -> Option<Message> {
+    let TrackingData::Landmarks { points, confidence } = &frame.data else { return None };
+    if text.contains("\"expressions\"") {
+        return None;
+    }
+    let mut bytes = Vec::new();
+    encode_landmarks(frame.t, points, confidence, &mut bytes).ok()?;
+    Some(Message::binary(bytes))
 }
 
 /// How a session came to its end.
@@ -336,15 +353,25 @@ async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sen
     End { is_normal: false, reason: last_error.unwrap_or_else(|| "the connection broke off".into()), errors }
 }
 
-/// The feed's hello, with `takeover` where it is wanted.
-fn hello(line: &str, takeover: bool) -> String {
-    match serde_json::from_str::<serde_json::Map<String, serde_json::Value>>(line) {
-        Ok(mut fields) if takeover => {
-            fields.insert("takeover".into(), true.into());
-            serde_json::Value::from(fields).to_string()
-        }
-        _ => line.to_owned(),
+/// The feed's hello, with `takeover` and the profile where they are wanted.
+fn hello(line: &str, options: &SendOptions) -> String {
+    if !options.takeover && options.profile.is_none() {
+        return line.to_owned();
     }
+    let Ok(mut fields) = serde_json::from_str::<serde_json::Map<String, serde_json::Value>>(line) else { return line.to_owned() };
+    if options.takeover {
+        fields.insert("takeover".into(), true.into());
+    }
+    match &options.profile {
+        Some(ProfileChoice::Given(profile)) => {
+            fields.insert("profile".into(), serde_json::to_value(profile).expect("plain data can be written"));
+        }
+        Some(ProfileChoice::Named(name)) => {
+            fields.insert("profile".into(), name.as_str().into());
+        }
+        None => {}
+    }
+    serde_json::Value::from(fields).to_string()
 }
 
 /// A failed handshake in the server's own words, where it has some.

@@ -3,11 +3,14 @@
 use crate::config::{Limits, ServerConfig, ServerConfigError, seconds};
 use crate::http::router;
 use crate::metrics::Metrics;
+use crate::profiles::{ProfileError, Profiles};
 use crate::room::Rooms;
 use crate::socket::{ErrorMessage, say_and_close};
 use crate::stream::{TimedStream, Wire};
 use crate::tls::{self, Identity, TlsError};
-use crate::token::{self, Checker, Keys};
+use crate::token::{Checker, Keys};
+use crate::trackers::listen::{self, Port, Trackers};
+use crate::trackers::vmc_out::{self, VmcOut};
 use axum::extract::Request;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use rhytid_shared::packet::PacketLayout;
@@ -64,6 +67,9 @@ pub enum ServerError {
         /// What is wrong with it.
         source: CharacterError,
     },
+    /// The folder of profiles cannot be used.
+    #[error(transparent)]
+    Profiles(#[from] ProfileError),
     /// There is no certificate.
     #[error(transparent)]
     Tls(#[from] TlsError),
@@ -91,6 +97,8 @@ pub(crate) struct Hub {
     pub hello_character: CharacterHello,
     pub layout: PacketLayout,
     pub rooms: Rooms,
+    pub trackers: Trackers,
+    pub profiles: Arc<Profiles>,
     pub metrics: Arc<Metrics>,
     pub listens_on_loopback: bool,
     /// Connections are under TLS.
@@ -141,7 +149,15 @@ pub async fn run(
 ) -> Result<(), ServerError> {
     config.validate()?;
     let address = listener.local_addr().map_err(|source| ServerError::Listen { address: config.listen.clone(), source })?;
-    let mut keys = token::demand(config.access.token_key.as_deref(), config.access.insecure, address.ip().is_loopback())?;
+    let mut keys = config.keys(address)?;
+    let (mut ports, mut outs) = (Vec::new(), Vec::new());
+    for spec in &config.listen_udp {
+        ports.push(Port::bind(spec).await?);
+    }
+    for spec in &config.vmc_out {
+        outs.push(VmcOut::bind(spec).await?);
+    }
+    let profiles = Profiles::load(config.profiles.as_deref())?;
     let metrics = Arc::new(Metrics::new());
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
@@ -149,7 +165,9 @@ pub async fn run(
     let hub = Arc::new(Hub {
         hello_character: ViewHello::new("", &character, character_url.clone()).character,
         layout: PacketLayout::from(&*character),
-        rooms: Rooms::new(config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
+        rooms: Rooms::new(character.clone(), config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
+        trackers: Trackers::default(),
+        profiles: Arc::new(profiles),
         listens_on_loopback: address.ip().is_loopback(),
         is_encrypted: identity.is_some(),
         tokens: keys.as_ref().map(Keys::checker),
@@ -164,7 +182,14 @@ pub async fn run(
         config,
     });
     let app = router(hub.clone());
+    // In the background: whoever watches is answered at once, and the first publisher does not wait for what all share.
+    tokio::task::spawn_blocking({
+        let hub = Arc::downgrade(&hub);
+        move || hub.upgrade().iter().for_each(|hub| crate::solve::prepare(&hub.character, &hub.config.solve))
+    });
     tracing::info!(%address, character = hub.character.name, "serving");
+    listen::start(&hub, ports);
+    vmc_out::start(&hub, outs);
     tokio::pin!(shutdown);
     let acceptor = identity.as_ref().map(Identity::acceptor);
     let mut reload = tokio::time::interval(tls::RELOAD_INTERVAL);

@@ -16,6 +16,7 @@ mod estimate;
 mod evaluate;
 mod expressions;
 mod filter;
+mod fit;
 mod gaze;
 mod head_pose;
 mod ingest;
@@ -24,9 +25,12 @@ mod landmarks_to_bones;
 mod lids;
 mod linear;
 mod lower_face;
+pub mod mix;
 mod points;
+mod ranges;
 mod rbf;
 mod rotation;
+mod settings;
 mod skeleton;
 mod weight_session;
 mod weights_to_bones;
@@ -41,16 +45,20 @@ pub mod stages {
     pub use super::rbf::{FitError, Regression};
 }
 
-pub use calibration::Calibration;
 pub use config::{CalibrationConfig, ConfigError, FilterConfig, LostConfig, OneEuroConfig, SolveConfig};
 pub use error::SolveError;
+pub use fit::{FitError, FitReport, StepReport};
+pub use rhytid_shared::Calibration;
 
 use easing::{Easing, FaceState};
 use evaluate::Evaluator;
+use fit::{Fit, Sample};
 use landmark_session::LandmarkSession;
+use ranges::{RangeRig, stretched};
 use rhytid_shared::limits::{MAX_EXPRESSIONS, MAX_SECONDS};
-use rhytid_shared::{Character, FaceFrame, HeadPose, PublishHello, TrackingData, TrackingFrame};
+use rhytid_shared::{Character, FaceFrame, HeadPose, ProfileChoice, PublishHello, Ranges, Settings, TrackingData, TrackingFrame};
 use serde::Serialize;
+use settings::Amplifier;
 use skeleton::Skeleton;
 use std::sync::Arc;
 use weight_session::{SentHead, WeightSession};
@@ -88,8 +96,24 @@ pub struct DelayReport {
     pub head: f64,
 }
 
+/// Makes what the sessions of a character share, which takes tens of milliseconds: a service does so before its first session
+/// comes, else that one does. The same character (by its `Arc`) is prepared once.
+pub fn prepare(character: &Arc<Character>, config: &SolveConfig) {
+    if config.estimate_weights {
+        estimate::ExpressionMap::shared(character);
+    }
+}
+
 /// Turns one publisher's tracking frames into face frames.
 pub struct Solver {
+    hello: PublishHello,
+    settings: Settings,
+    amplifier: Amplifier,
+    ranges: Ranges,
+    range_rig: RangeRig,
+    fit: Fit,
+    /// The newest face as it was seen, while it is measured.
+    sample: Option<Sample>,
     character: Arc<Character>,
     config: SolveConfig,
     landmarks: Option<LandmarkSession>,
@@ -129,9 +153,17 @@ impl Solver {
             Some(layout) => Some(LandmarkSession::new(&character, config, layout, hello)?),
             None => None,
         };
-        Ok(Self {
+        let weights = WeightSession::new(&character, config);
+        let mut solver = Self {
+            hello: hello.clone(),
+            settings: Settings::default(),
+            amplifier: Amplifier::new(&character),
+            ranges: Ranges::ONE,
+            range_rig: RangeRig::new(&character, weights.rig()),
+            fit: Fit::default(),
+            sample: None,
             landmarks,
-            weights: WeightSession::new(&character, config),
+            weights,
             sent_head: SentHead::new(config.mirror),
             skeleton: Skeleton::new(&character),
             evaluator: Evaluator::new(&character),
@@ -147,7 +179,12 @@ impl Solver {
             seq: 0,
             config: config.clone(),
             character,
-        })
+        };
+        if let Some(ProfileChoice::Given(profile)) = &hello.profile {
+            solver.use_profile(profile)?;
+        }
+        solver.set(&hello.settings)?;
+        Ok(solver)
     }
 
     /// As [`Self::new`], with a neutral from an earlier session in place of the search for one.
@@ -159,7 +196,7 @@ impl Solver {
     ) -> Result<Self, SolveError> {
         let mut solver = Self::new(character, config, hello)?;
         let num_points = solver.landmarks.as_ref().map_or(0, LandmarkSession::num_points);
-        if let Some(problem) = calibration.problem(num_points, solver.character.head_pivot.as_dvec3()) {
+        if let Some(problem) = calibration::problem(&calibration, num_points, solver.character.head_pivot.as_dvec3()) {
             return Err(SolveError::BadCalibration { problem });
         }
         match &mut solver.landmarks {
@@ -195,7 +232,7 @@ impl Solver {
     fn calibrate_sent(&mut self, t: f64) {
         let (rotation, position) = self.sent_head.calibrate();
         let weights = if self.last_source == Some(Source::Weights) { self.weights.calibrate() } else { None };
-        let calibration = Calibration::of_weights(t, weights, rotation, position);
+        let calibration = calibration::of_weights(t, weights, rotation, position);
         self.report = Some(report_of(&calibration));
         self.sent_calibration = Some(calibration);
         self.blend = Some(self.config.calibration.blend);
@@ -240,6 +277,10 @@ impl Solver {
                 self.easing.show_none(t);
             }
         }
+        let sample = self.sample.take();
+        if self.fit.is_running() && self.fit.observe(t, sample).is_some() {
+            self.end_fit_step();
+        }
         out.seq = self.seq;
         self.seq = self.seq.wrapping_add(1);
         out.captured_at_micros = libm::round(t * 1e6) as u64;
@@ -255,6 +296,22 @@ impl Solver {
             }
         }
         let source = self.aim_bones(frame.t, &frame.data)?;
+        if self.fit.is_running() {
+            self.sample = match source {
+                Some(Source::Weights) => Some(Sample::of_weights(self.weights.seen())),
+                Some(Source::Landmarks) => {
+                    Some(Sample::of_landmarks(self.range_rig.amounts(&self.target.motions), frame, self.hello.image))
+                }
+                Some(Source::Bones) | None => None,
+            };
+        }
+        if source == Some(Source::Landmarks) {
+            self.stretch_landmarks();
+        }
+        // An animator's own bones are where they shall be.
+        if matches!(source, Some(Source::Landmarks | Source::Weights)) {
+            self.amplifier.amplify(&mut self.target);
+        }
         // What the publisher says of expressions counts before what weights say. Weights that are estimated lack what landmarks
         // hardly show: the bones' influences, which the same landmarks drive, say more.
         let known = match (&frame.expressions, &self.target.weights, &self.zones) {
@@ -265,6 +322,20 @@ impl Solver {
         self.target.bridge = if known.is_none() { 1.0 } else { 0.0 };
         self.target.expressions = known.unwrap_or([[0.0; 2]; MAX_EXPRESSIONS]);
         Ok(source)
+    }
+
+    /// Stretches what landmarks gave to the performer's ranges; weights have been stretched before they moved bones.
+    fn stretch_landmarks(&mut self) {
+        if self.range_rig.is_one() {
+            return;
+        }
+        self.range_rig.stretch(&mut self.target.motions);
+        self.amplifier.limit(&mut self.target.motions);
+        if let Some(weights) = &mut self.target.weights {
+            for (weight, factor) in weights.iter_mut().zip(self.range_rig.of_shapes()) {
+                *weight = stretched(*weight, factor, 1.0);
+            }
+        }
     }
 
     /// Computes the bones of one frame; nothing where there is no face.
@@ -341,8 +412,8 @@ impl Solver {
         match (&self.landmarks, self.last_source) {
             (Some(landmarks), Some(Source::Landmarks) | None) => landmarks.added_delay(),
             (_, Some(Source::Weights)) => {
-                let delay = self.weights.added_delay();
-                DelayReport { brows: delay, eyelids: delay, mouth: delay, head: 0.0 }
+                let [brows, eyelids, mouth] = self.weights.added_delays();
+                DelayReport { brows, eyelids, mouth, head: 0.0 }
             }
             _ => DelayReport::default(),
         }

@@ -4,7 +4,7 @@ use anyhow::Context;
 use clap::Args;
 use rhytid_server::{Role, make_key_file, make_token};
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 /// Longest file of a token.
@@ -56,16 +56,31 @@ pub(crate) fn token(args: &TokenArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The token that was given: by itself, in a file, or in the environment.
-pub(crate) fn given(token: Option<String>, file: Option<&Path>) -> anyhow::Result<Option<String>> {
-    let token = match file {
-        Some(path) => {
-            let mut text = String::new();
-            let file = std::fs::File::open(path).with_context(|| format!("cannot read token {}", path.display()))?;
-            file.take(MOST_TOKEN_BYTES).read_to_string(&mut text).with_context(|| format!("cannot read token {}", path.display()))?;
-            Some(text)
-        }
-        None => token.or_else(|| std::env::var("RHYTID_TOKEN").ok()),
-    };
-    Ok(token.map(|token| token.trim().to_owned()).filter(|token| !token.is_empty()))
+/// How a command that goes to a server is given its token.
+#[derive(Args)]
+pub(crate) struct GivenToken {
+    /// What lets it in, where the server wants to know; else from the environment's RHYTID_TOKEN. Others on this machine can read
+    /// the arguments of a command: rather use a file.
+    #[arg(long, value_name = "TOKEN", conflicts_with = "token_file")]
+    token: Option<String>,
+    /// A file with the token.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+}
+
+impl GivenToken {
+    /// The token, if there is one: given by itself, in a file, or in the environment.
+    pub(crate) fn read(self) -> anyhow::Result<Option<String>> {
+        let token = match &self.token_file {
+            Some(path) => {
+                let reading = || format!("cannot read token {}", path.display());
+                let mut text = String::new();
+                let file = std::fs::File::open(path).with_context(reading)?;
+                file.take(MOST_TOKEN_BYTES).read_to_string(&mut text).with_context(reading)?;
+                Some(text)
+            }
+            None => self.token.or_else(|| std::env::var("RHYTID_TOKEN").ok()),
+        };
+        Ok(token.map(|token| token.trim().to_owned()).filter(|token| !token.is_empty()))
+    }
 }

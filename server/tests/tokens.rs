@@ -108,18 +108,35 @@ fn sockets_and_pages_open_to_the_right_token_only() {
     // A browser's way. An address is no place for a token.
     let offer = |token: &str| [("sec-websocket-protocol", format!("rhytid.v1, rhytid.token.{token}"))];
     assert_eq!(refused("demo/view", &offer(&view)), None);
+    // Who speaks for a source may do to its face what its publisher may.
+    assert_eq!(refused("demo/control", &[]).as_deref(), Some("token_missing"));
+    assert_eq!(refused("demo/control", &header(&view)).as_deref(), Some("token_role"));
+    assert_eq!(refused("other/control", &header(&publish)).as_deref(), Some("token_room"));
+    assert_eq!(refused("demo/control", &header(&publish)), None);
     assert_eq!(refused("demo/publish", &offer(&view)).as_deref(), Some("token_role"));
     assert_eq!(refused(&format!("demo/view?token={view}"), &[]).as_deref(), Some("token_missing"));
 
     assert_eq!(server.get("/healthz", None).0, 200);
     assert_eq!(server.get("/", None).0, 200);
-    for path in ["/metrics", "/api/rooms"] {
+    for path in ["/metrics", "/api/rooms", "/api/trackers", "/api/profiles"] {
         assert_eq!(server.get(path, None).0, 401, "{path}");
         assert_eq!(server.get(path, Some(&publish)).0, 403, "{path}");
         assert_eq!(server.get(path, Some(&admin)).0, 200, "{path}");
     }
     let (_, metrics) = server.get("/metrics", Some(&admin));
-    assert!(metrics.contains("reason=\"token_role\"} 3") || metrics.contains("reason=\"token_role\"} 4"), "{metrics}");
+    assert!(metrics.contains("reason=\"token_role\"} 7"), "three sockets and four pages: {metrics}");
+    // A page asks why it is not let in.
+    for (query, token, status, said) in [
+        ("role=view&room=demo", None, 401, "token_missing"),
+        ("role=view&room=demo", Some(&view), 200, "\"tokens\":true"),
+        ("role=publish&room=demo", Some(&view), 403, "token_role"),
+        ("role=view&room=other", Some(&view), 403, "token_room"),
+        ("role=king&room=demo", Some(&admin), 400, "unknown_role"),
+        ("role=view&room=a%20b", Some(&admin), 400, "bad_room_name"),
+    ] {
+        let (got, body) = server.get(&format!("/api/access?{query}"), token.map(String::as_str));
+        assert!(got == status && body.contains(said), "{query}: {got} {body}");
+    }
 }
 
 #[test]
@@ -152,6 +169,28 @@ fn server_that_others_reach_wants_tokens_or_to_be_told_otherwise() {
     let output = Command::new(PROGRAM).args(["serve", "--listen", "0.0.0.0:0"]).output().unwrap();
     assert!(!output.status.success() && output.stdout.is_empty());
     assert!(String::from_utf8_lossy(&output.stderr).contains("--token-key"), "{output:?}");
+    // Datagrams bear no tokens.
+    let key = Scratch::new("reach");
+    make_key_file(&key.0).unwrap();
+    let with_port = |port: &str| {
+        let mut child = Command::new(PROGRAM)
+            .args(["serve", "--listen", "127.0.0.1:0", "--token-key", key.shown(), "--listen-udp", port])
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let _ = child.kill();
+        let mut said = String::new();
+        child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+        child.wait().unwrap();
+        (line.starts_with("listening"), said)
+    };
+    let (listens, said) = with_port("livelink=0.0.0.0:0");
+    assert!(!listens && said.contains("allow=IP"), "{said}");
+    assert!(with_port("livelink=0.0.0.0:0,allow=192.0.2.1").0);
+    assert!(with_port("livelink=127.0.0.1:0").0);
     let server = Served::start(&["--listen", "0.0.0.0:0", "--insecure"]);
     assert!(server.open("demo/view", &[]).is_ok());
     assert_eq!(server.get("/metrics", None).0, 200);

@@ -12,5 +12,5 @@ mod zones;
 pub use checked::{
     Bone, Character, CharacterError, Corrective, Drive, GroupDegenerate, LandmarkWeight, LidKind, Mode, Pose, ShapeDeltas, Side, WrinkleMap,
 };
-pub use colour::{Colour, ColourChange};
+pub use colour::{Colour, ColourChange, ColourDriver};
 pub use zones::{BridgeRow, Expression, Zone, ZoneMap, Zones};

@@ -19,7 +19,11 @@ pub mod view;
 pub use character::{Character, CharacterError};
 pub use face::{FaceFrame, HeadPose};
 pub use names::{ARKIT_NAMES, ArkitShape, NUM_ARKIT_SHAPES, NameError, RoomName};
-pub use tracking::{MessageError, PublishHello, PublishMessage, PublishReader, TrackingData, TrackingFrame};
+pub use tracking::{
+    Calibration, ChannelGroup, ChannelGroups, Command, FIT_SECONDS, FaceKind, FitRequest, FitStep, GroupValues, MessageError,
+    PROFILE_VERSION, Profile, ProfileChoice, PublishHello, PublishMessage, PublishReader, RANGE_FACTORS, Ranges, Settings, Slot,
+    TrackingData, TrackingFrame, encode_landmarks,
+};
 
 /// The default character (CC0, see the file's `asset.copyright`), as `cargo xtask bake` made it.
 pub const DEFAULT_CHARACTER_GLB: &[u8] = include_bytes!("../assets/default.glb");

@@ -1,7 +1,11 @@
 //! What a tracker publishes: the checked messages, and the reader that turns their JSON into them.
 
+mod binary;
 mod fields;
+mod profile;
 mod reader;
+mod settings;
+mod slot;
 
 use crate::face::HeadPose;
 use crate::layout::Layout;
@@ -9,7 +13,13 @@ use crate::limits::MAX_EXPRESSIONS;
 use crate::names::NUM_ARKIT_SHAPES;
 use glam::Vec3;
 
+pub use binary::encode_landmarks;
+pub use profile::{
+    Calibration, FIT_SECONDS, FaceKind, FitRequest, FitStep, PROFILE_VERSION, Profile, ProfileChoice, RANGE_FACTORS, Ranges,
+};
 pub use reader::PublishReader;
+pub use settings::{GroupValues, Settings};
+pub use slot::{ChannelGroup, ChannelGroups, Slot};
 
 /// A publisher's first message, checked. By default one of an unnamed sender of weights or bones.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -25,10 +35,16 @@ pub struct PublishHello {
     /// Focal length of the tracker's camera, pixels; the image width serves where it is unknown. With an image within
     /// [`FOCAL_RANGE`](crate::limits::FOCAL_RANGE) of its width.
     pub focal: Option<f32>,
-    /// Take the room over from another publisher.
+    /// Take the slot over from another publisher.
     pub takeover: bool,
+    /// The source slot that it claims.
+    pub slot: Slot,
+    /// Settings to start with.
+    pub settings: Settings,
     /// Start from the neutral face that the room keeps of the same tracker, see [`Self::is_of_same_tracker`].
     pub keep_neutral: bool,
+    /// What is known of the performer.
+    pub profile: Option<ProfileChoice>,
 }
 
 impl PublishHello {
@@ -99,8 +115,23 @@ pub enum PublishMessage {
     Hello(PublishHello),
     /// A frame; it stands in the [`TrackingFrame`] given to [`PublishReader::read`].
     Frame,
+    /// Anything that a publisher, or somebody for it, asks for.
+    Command(Command),
+}
+
+/// What a source is asked for besides taking frames: by its publisher, or over a control socket.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Command {
     /// Take the neutral face now.
     Calibrate,
+    /// Change some settings.
+    Settings(Settings),
+    /// The head's present pose is straight ahead.
+    Recentre,
+    /// A step of the guided fit.
+    Fit(FitRequest),
+    /// Use this profile.
+    Profile(ProfileChoice),
 }
 
 /// Why a publish message was refused. `message` names the field and what was expected.

@@ -5,7 +5,7 @@
 mod small;
 
 use rhytid_shared::Character;
-use rhytid_shared::character::{Colour, ColourChange};
+use rhytid_shared::character::{Colour, ColourChange, ColourDriver};
 use serde_json::{Value, json};
 use small::{Glb, png};
 
@@ -27,7 +27,7 @@ fn assert_refused(breaking: impl FnOnce(&mut Glb), parts: &[&str]) {
 #[test]
 fn colour_is_read_as_it_is_written() {
     let character = Character::from_glb(&Glb::small_character().with_colour().to_bytes()).unwrap();
-    let change = ColourChange { pose: 0, texture: 2, spread: 0.5, shift: 0.3 };
+    let change = ColourChange { driver: ColourDriver::Pose(0), texture: 2, spread: 0.5, shift: 0.3 };
     assert_eq!(character.colour, Some(Colour { base: 1, most: 2.0, changes: vec![change], strength: 1.0 }));
     assert!(Character::from_glb(&Glb::small_character().to_bytes()).unwrap().colour.is_none());
 }
@@ -50,6 +50,24 @@ fn poses_that_are_not_there_or_named_twice() {
         colour(glb)["changes"] = json!([change.clone(), change]);
     };
     assert_refused(twice, &["colour.changes[1].pose", "\"up\", which has its change already"]);
+}
+
+#[test]
+fn zones_drive_it_in_place_of_poses() {
+    let mut glb = Glb::small_character().with_zones().with_colour();
+    let zone = glb.json["extensions"]["RHYTID_face"]["zones"]["list"][0]["name"].clone();
+    let change = &mut colour(&mut glb)["changes"][0];
+    change.as_object_mut().unwrap().remove("pose");
+    change["zone"] = zone;
+    let read = Character::from_glb(&glb.to_bytes()).unwrap().colour.unwrap();
+    assert_eq!(read.changes[0].driver, ColourDriver::Zone(0));
+    assert_refused(|glb| colour(glb)["changes"][0]["zone"] = json!("red"), &["colour.changes[0]", "expected one of both"]);
+    assert_refused(|glb| drop(colour(glb)["changes"][0].as_object_mut().unwrap().remove("pose")), &["colour.changes[0]", "neither"]);
+    let nowhere = |glb: &mut Glb| {
+        colour(glb)["changes"][0].as_object_mut().unwrap().remove("pose");
+        colour(glb)["changes"][0]["zone"] = json!("nowhere");
+    };
+    assert_refused(nowhere, &["colour.changes[0].zone", "\"nowhere\", which is no zone"]);
 }
 
 #[test]

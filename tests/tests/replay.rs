@@ -29,7 +29,7 @@ fn replay(config: &SolveConfig) -> Replay {
     let mut replay = Replay { sha256: String::new(), num_packets: 0, num_key_packets: 0, num_bytes: 0 };
     while let Some(item) = feed.next_frame(&mut frame).expect("the demo session has no bad line") {
         match item {
-            FeedItem::Calibrate => pipeline.calibrate(),
+            FeedItem::Command(command) => pipeline.command(&command).expect("the feed's commands are sound"),
             FeedItem::Frame => {
                 let kind = pipeline.frame(&frame, &mut packet).expect("every frame is solved");
                 hash.update((packet.len() as u64).to_le_bytes());

@@ -5,10 +5,12 @@
 mod service {
     pub mod bad_input;
     pub mod expressions;
+    pub mod fitting;
     pub mod harness;
     pub mod http;
     pub mod neutral;
     pub mod rooms;
     pub mod sending;
+    pub mod slots;
     pub mod tls;
 }

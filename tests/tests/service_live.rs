@@ -6,6 +6,7 @@ use libtest_mimic::{Arguments, Failed, Trial};
 use rhytid_client::renderer::AdapterChoice;
 use rhytid_client::{CharacterAsset, Headless};
 use rhytid_shared::DEFAULT_CHARACTER_GLB;
+use rhytid_tests::program;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
@@ -43,24 +44,6 @@ fn has_websockets() -> bool {
 /// The workspace's folder.
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
-}
-
-/// A program of the workspace, of the same profile as this test: as it stands, and built where it does not.
-fn program(name: &str) -> Result<PathBuf> {
-    let test = std::env::current_exe()?;
-    // target/PROFILE/deps/test
-    let folder = test.parent().and_then(Path::parent).context("the test stands in the build's folder")?;
-    let path = folder.join(name).with_extension(std::env::consts::EXE_EXTENSION);
-    if !path.is_file() {
-        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        let mut build = Command::new(cargo);
-        build.current_dir(root()).args(["build", "-p", name, "--bin", name]);
-        if folder.ends_with("release") {
-            build.arg("--release");
-        }
-        ensure!(build.status()?.success(), "cannot build {name}");
-    }
-    Ok(path)
 }
 
 /// A process that ends with the test.

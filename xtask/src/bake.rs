@@ -88,7 +88,7 @@ fn bake(source: &mut source::Source) -> Result<Vec<u8>> {
         bones: rig.bones.clone(),
         groups: rig.groups.clone(),
         poses,
-        correctives: Vec::new(),
+        correctives: poses::correctives(&skin.mesh, rig),
         zones: None,
         colour: None,
         evaluation: schema::Evaluation::default(),

@@ -1,6 +1,6 @@
 //! The main job, shown: a server, a tracker session published over a real WebSocket, and the face it gives.
 
-use crate::{setup, workspace_root};
+use crate::{setup, web, workspace_root};
 use anyhow::{Context, Result, ensure};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -25,6 +25,7 @@ pub fn run() -> Result<()> {
     ctrlc::set_handler(move || flag.store(true, Ordering::SeqCst)).context("cannot listen for signals")?;
 
     setup::run()?;
+    web::run_where_possible();
     println!("demo: building (the first time takes some minutes)");
     let root = workspace_root();
     let status = Command::new(env!("CARGO"))
@@ -43,7 +44,7 @@ pub fn run() -> Result<()> {
         Command::new(bin.join("rhytid-server")).args(["serve", "--listen", "127.0.0.1:0"]).stdout(Stdio::piped()),
     )?;
     let url = server.listening_url()?.replacen("http://", "ws://", 1);
-    println!("demo: serving at {url}, room demo");
+    println!("demo: serving at {url}, room demo; in a browser: {}/?room=demo", url.replacen("ws://", "http://", 1));
 
     let feed = root.join("shared/assets/demo.ibug68.jsonl");
     let mut sender = Command::new(bin.join("rhytid-server"));

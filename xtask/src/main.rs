@@ -1,10 +1,12 @@
-//! Developer commands: `cargo xtask demo | test | setup | bake | convert | gallery`.
+//! Developer commands: `cargo xtask demo | test | web | setup | bake | convert | gallery`.
 
 mod bake;
 mod convert;
 mod demo;
 mod gallery;
+mod npm;
 mod setup;
+mod web;
 
 use anyhow::{Context, Result, ensure};
 use clap::{Parser, Subcommand};
@@ -28,6 +30,8 @@ enum Task {
         #[arg(trailing_var_arg = true)]
         arguments: Vec<String>,
     },
+    /// Compile the client to WebAssembly and put the page in the browser together, in target/web
+    Web,
     /// Find out what this machine lacks and install it where that is possible (`RHYTID_NO_INSTALL=1` forbids it)
     Setup,
     /// Make the default character, shared/assets/default.glb, from its CC0 sources
@@ -46,6 +50,7 @@ fn main() -> ExitCode {
     let result = match Arguments::parse().command {
         Task::Demo => demo::run(),
         Task::Test { arguments } => test(&arguments),
+        Task::Web => web::run(),
         Task::Setup => setup::run(),
         Task::Bake => bake::run(),
         Task::Convert(conversion) => convert::run(&conversion),
@@ -62,6 +67,7 @@ fn main() -> ExitCode {
 
 fn test(arguments: &[String]) -> Result<()> {
     setup::run()?;
+    web::run_where_possible();
     let status = Command::new(env!("CARGO"))
         .current_dir(workspace_root())
         .args(["test", "--workspace"])

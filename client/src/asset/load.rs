@@ -268,6 +268,9 @@ impl Images<'_> {
     }
 }
 
+/// Key in a material's `extras`: blue of its metallic-roughness texture is the strength of highlights.
+const INTENSITY_IN_BLUE: &str = "rhytid_intensity_in_blue";
+
 fn read_material(material: &gltf::Material<'_>, images: &mut Images<'_>) -> Result<MaterialAsset> {
     let pbr = material.pbr_metallic_roughness();
     let albedo = match pbr.base_color_texture() {
@@ -286,12 +289,17 @@ fn read_material(material: &gltf::Material<'_>, images: &mut Images<'_>) -> Resu
         Some(info) => (images.of_texture(info.texture().index())?.cloned(), info.strength().clamp(0.0, 1.0)),
         None => (None, 0.0),
     };
+    // Of skin that is no metal a metallic map says nothing: its blue is free for how strong highlights are.
+    let extras = material.extras().as_ref().and_then(|extras| serde_json::from_str::<serde_json::Value>(extras.get()).ok());
+    let says_so = extras.and_then(|extras| extras.get(INTENSITY_IN_BLUE)?.as_bool()) == Some(true);
+    let has_intensity = says_so && roughness_image.is_some();
     Ok(MaterialAsset {
         base_color: pbr.base_color_factor(),
         albedo,
         normal,
         normal_scale,
-        surface_map: surface_map(occlusion_image, roughness_image),
+        surface_map: surface_map(occlusion_image, roughness_image, has_intensity),
+        has_intensity,
         roughness: pbr.roughness_factor(),
         occlusion_strength,
         alpha: match material.alpha_mode() {
@@ -302,8 +310,9 @@ fn read_material(material: &gltf::Material<'_>, images: &mut Images<'_>) -> Resu
     })
 }
 
-/// Occlusion (red of its image) and roughness (green of its image) in one map of the larger image's size.
-fn surface_map(occlusion: Option<RgbaImage>, roughness: Option<RgbaImage>) -> Option<MipChain> {
+/// Occlusion (red of its image), roughness and, where it is there, intensity (green and blue of another) in one map of the
+/// larger image's size.
+fn surface_map(occlusion: Option<RgbaImage>, roughness: Option<RgbaImage>, has_intensity: bool) -> Option<MipChain> {
     let largest = [&occlusion, &roughness].into_iter().flatten().map(|image| image.dimensions()).max()?;
     let scaled = |image: Option<RgbaImage>| match image {
         Some(image) if image.dimensions() == largest => image,
@@ -311,8 +320,13 @@ fn surface_map(occlusion: Option<RgbaImage>, roughness: Option<RgbaImage>) -> Op
         None => RgbaImage::from_pixel(largest.0, largest.1, image::Rgba([255; 4])),
     };
     let (occlusion, roughness) = (scaled(occlusion), scaled(roughness));
-    let texels = occlusion.pixels().zip(roughness.pixels()).flat_map(|(occlusion, roughness)| [occlusion[0], roughness[1]]).collect();
-    Some(MipChain::from_texels([largest.0, largest.1], Texels::Linear2, texels))
+    let pairs = || occlusion.pixels().zip(roughness.pixels());
+    let (kind, texels) = if has_intensity {
+        (Texels::Linear4, pairs().flat_map(|(occlusion, roughness)| [occlusion[0], roughness[1], roughness[2], 255]).collect())
+    } else {
+        (Texels::Linear2, pairs().flat_map(|(occlusion, roughness)| [occlusion[0], roughness[1]]).collect())
+    };
+    Some(MipChain::from_texels([largest.0, largest.1], kind, texels))
 }
 
 fn read_zones(character: &Character, images: &mut Images<'_>) -> Result<Option<ZoneMaps>> {

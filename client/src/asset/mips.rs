@@ -11,7 +11,7 @@ pub enum Texels {
     Slopes,
     /// Linear values in red and green (occlusion, roughness). 2 bytes.
     Linear2,
-    /// Four linear values (masks, differences of normals). 4 bytes.
+    /// Four linear values (masks, differences of normals, occlusion with roughness and intensity). 4 bytes.
     Linear4,
 }
 

@@ -68,8 +68,8 @@ pub(super) fn tracker(easel: &mut Easel) -> Result<Sheet> {
     let mut solved = FaceFrame::at_rest(&character);
     let mut moments: Vec<Moment> = Vec::new();
     while let Some(item) = feed.next_frame(&mut tracked)? {
-        if item == FeedItem::Calibrate {
-            solver.calibrate();
+        if let FeedItem::Command(command) = item {
+            solver.command(&command)?;
             continue;
         }
         solver.solve(&tracked, &mut solved).map_err(|source| PictureError::Frame {

@@ -4,15 +4,13 @@ use super::Result;
 use crate::asset::CharacterAsset;
 use crate::render_cli::{PictureError, averaged, load_character, solve_first};
 use crate::renderer::{Camera, DrawSettings, Headless, RenderFrame};
+use crate::view::expressions::Amounts;
 use glam::Vec3;
 use image::RgbaImage;
 use rhytid_shared::limits::MAX_EXPRESSIONS;
 use rhytid_shared::{ArkitShape, Character, NUM_ARKIT_SHAPES, TrackingData, TrackingFrame};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-
-/// Amounts by name.
-pub(super) type Amounts = [(&'static str, f32)];
 
 /// How much nearer than the usual front view, and how much higher, metres: the face from the hair to the chin fills the
 /// picture. Tuned by eye.

@@ -2,11 +2,11 @@
 
 use super::Result;
 use super::easel::Easel;
-use super::expressions::{DISGUST, SURPRISE};
 use crate::asset::{CharacterAsset, MipChain, Surface, Texels, ZoneMaps};
 use crate::render_cli::PictureError;
 use crate::renderer::{DrawSettings, RenderFrame, ViewMode, WrinkleSystem, ZoneBlend};
 use crate::sheet::{Cell, Row, Sheet};
+use crate::view::expressions::{DISGUST, SURPRISE};
 use glam::{Vec2, Vec3};
 use image::{Rgba, RgbaImage};
 

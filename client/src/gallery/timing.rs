@@ -2,9 +2,9 @@
 
 use super::Result;
 use super::easel::Easel;
-use super::expressions::SURPRISE;
 use crate::renderer::{DrawSettings, RenderFrame, ViewMode, WrinkleSystem, ZoneBlend};
 use crate::sheet::{Cell, Content, Row, Sheet};
+use crate::view::expressions::SURPRISE;
 use glam::Vec3;
 use std::time::Instant;
 

@@ -2,10 +2,10 @@
 
 use super::Result;
 use super::easel::Easel;
-use super::expressions::{self, ANGER, COMPLEX, DISGUST, Expression, JOY, SURPRISE};
 use crate::render_cli::PictureError;
 use crate::renderer::{DrawSettings, RenderFrame, Studio, ViewMode, WrinkleSystem};
 use crate::sheet::{Cell, Content, Row, Sheet};
+use crate::view::expressions::{self, ANGER, COMPLEX, DISGUST, Expression, JOY, SURPRISE};
 use glam::Vec3;
 
 fn zones_only(settings: DrawSettings) -> DrawSettings {

@@ -2,6 +2,9 @@
 
 use super::pipelines::{DEPTH_FORMAT, SAMPLES, SCENE_FORMAT};
 
+/// Depth of what lies behind everything, metres behind the camera's target: `FAR` in `output.wgsl`.
+pub const FAR: f64 = 8.0;
+
 /// The pipeline; it draws three vertices and needs nothing bound.
 pub fn pipeline(device: &wgpu::Device) -> wgpu::RenderPipeline {
     let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {

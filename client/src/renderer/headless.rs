@@ -1,5 +1,7 @@
 //! Pictures without a window.
 
+use super::device::{optional_features, required_limits};
+use super::picture_texture::picture_texture;
 use super::read_back::read_back;
 use super::{DrawSettings, Pass, PassTimer, RenderFrame, Renderer};
 use crate::asset::CharacterAsset;
@@ -155,16 +157,7 @@ impl Headless {
         if size.iter().any(|&side| side == 0 || side > most) {
             return Err(RenderError::Size { got: size, most });
         }
-        Ok(self.device.create_texture(&wgpu::TextureDescriptor {
-            label: Some("headless picture"),
-            size: wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 },
-            mip_level_count: 1,
-            sample_count: 1,
-            dimension: wgpu::TextureDimension::D2,
-            format: FORMAT,
-            usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
-            view_formats: &[],
-        }))
+        Ok(picture_texture(&self.device, "headless picture", size, FORMAT, wgpu::TextureUsages::COPY_SRC))
     }
 
     fn record(
@@ -206,14 +199,4 @@ async fn open_device(choice: AdapterChoice) -> Result<(wgpu::AdapterInfo, wgpu::
         .await
         .map_err(|error| RenderError::NoDevice { adapter: info.name.clone(), problem: error.to_string() })?;
     Ok((info, device, queue))
-}
-
-/// What the renderer uses where an adapter has it.
-pub fn optional_features(adapter: &wgpu::Adapter) -> wgpu::Features {
-    adapter.features() & wgpu::Features::TEXTURE_COMPRESSION_BC
-}
-
-/// What WebGL2 guarantees, with textures as large as the adapter has them.
-pub fn required_limits(adapter: &wgpu::Adapter) -> wgpu::Limits {
-    wgpu::Limits::downlevel_webgl2_defaults().using_resolution(adapter.limits())
 }

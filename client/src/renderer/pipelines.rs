@@ -22,6 +22,12 @@ pub enum Look {
     Influence,
     /// Normals with wrinkles, blended by this mode.
     Normals(usize),
+    /// Masks of the zones.
+    ZoneMasks,
+    /// Skinning weights of the bones.
+    BoneMasks,
+    /// How far shapes move.
+    Deltas,
 }
 
 impl Look {
@@ -87,6 +93,8 @@ enum Pass {
     Surface(ShaderKind),
     Influence,
     Normals,
+    Masks,
+    Deltas,
     Wireframe,
 }
 
@@ -108,6 +116,8 @@ impl Pass {
             Self::Surface(ShaderKind::Hair) => rhytid_shaders::HAIR,
             Self::Influence => rhytid_shaders::INFLUENCE,
             Self::Normals => rhytid_shaders::NORMALS,
+            Self::Masks => rhytid_shaders::MASKS,
+            Self::Deltas => rhytid_shaders::DELTAS,
             Self::Wireframe => rhytid_shaders::WIREFRAME,
         }
     }
@@ -135,6 +145,9 @@ impl Pipelines {
                 Look::Bare => (Pass::Surface(key.shader), "vs_bare", "fs_bare", 0),
                 Look::Influence => (Pass::Influence, "vs_wrinkled", "fs_influence", 0),
                 Look::Normals(blend) => (Pass::Normals, "vs_wrinkled", "fs_wrinkled", blend),
+                Look::ZoneMasks => (Pass::Masks, "vs_bare", "fs_zones", 0),
+                Look::BoneMasks => (Pass::Masks, "vs_bones", "fs_bones", 0),
+                Look::Deltas => (Pass::Deltas, "vs_deltas", "fs_deltas", 0),
             };
             let constants = [
                 ("NUM_POSES", self.num_poses as f64),
@@ -215,7 +228,7 @@ impl Key {
         };
         let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
         let is_wrinkled = matches!(look, Look::Wrinkled(_) | Look::Normals(_)) && shader == ShaderKind::Skin;
-        let zones = if is_wrinkled { zones } else { 0 };
+        let zones = if is_wrinkled || (look == Look::ZoneMasks && shader == ShaderKind::Skin) { zones } else { 0 };
         Self {
             zones,
             has_stretch: zones != 0 && has_stretch,
@@ -233,7 +246,8 @@ impl Key {
 enum Mixing {
     /// It is covered.
     None,
-    /// It stays, highlights are added to its own.
+    /// It stays, highlights are added to its own. WebGL2 blends all attachments alike: a film's light from below is 0, and all
+    /// alphas stay.
     Film,
     /// It is covered by the share that alpha says; strands in any order, they are alike. Its own alphas (depth, scattering) stay but for that share of
     /// [`STRAND_STAND_OFF`]: scattering neither blurs the strand nor takes its darkness into the skin.
@@ -251,7 +265,8 @@ impl Mixing {
             Self::None => None,
             Self::Film => {
                 let sum = of(BlendFactor::One, BlendFactor::One, BlendOperation::Add);
-                Some(wgpu::BlendState { color: sum, alpha: sum })
+                let kept = of(BlendFactor::Zero, BlendFactor::One, BlendOperation::Add);
+                Some(wgpu::BlendState { color: sum, alpha: kept })
             }
             Self::Strand => Some(wgpu::BlendState {
                 color: of(BlendFactor::SrcAlpha, BlendFactor::OneMinusSrcAlpha, BlendOperation::Add),
@@ -276,7 +291,7 @@ struct SceneParts<'a> {
 
 fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::RenderPipeline {
     let options = wgpu::PipelineCompilationOptions { constants: parts.constants, ..Default::default() };
-    let is_film = parts.mixing == Mixing::Film;
+    let target = Some(wgpu::ColorTargetState { format: SCENE_FORMAT, blend: parts.mixing.blend(), write_mask: wgpu::ColorWrites::ALL });
     device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
         label: Some(parts.label),
         layout: Some(parts.layout),
@@ -299,18 +314,7 @@ fn scene_pipeline(device: &wgpu::Device, parts: &SceneParts<'_>) -> wgpu::Render
             module: parts.module,
             entry_point: Some(parts.fragment_entry),
             compilation_options: options,
-            targets: &[
-                Some(wgpu::ColorTargetState {
-                    format: SCENE_FORMAT,
-                    blend: parts.mixing.blend(),
-                    write_mask: if is_film { wgpu::ColorWrites::COLOR } else { wgpu::ColorWrites::ALL },
-                }),
-                Some(wgpu::ColorTargetState {
-                    format: SCENE_FORMAT,
-                    blend: if is_film { None } else { parts.mixing.blend() },
-                    write_mask: if is_film { wgpu::ColorWrites::empty() } else { wgpu::ColorWrites::ALL },
-                }),
-            ],
+            targets: &[target.clone(), target],
         }),
         multiview_mask: None,
         cache: None,

@@ -23,6 +23,7 @@ impl Presenter {
                 uniform(0, wgpu::ShaderStages::FRAGMENT, size_of::<uniforms::Present>()),
                 filtered_picture(1),
                 fullscreen::filtering_sampler(2),
+                filtered_picture(3),
             ],
         });
         let pipeline = fullscreen::pipeline(device, "present", rhytid_shaders::PRESENT, "fs_present", &layout, target_format);
@@ -30,8 +31,8 @@ impl Presenter {
         Self { pipeline, layout, block, target_encodes_srgb: target_format.is_srgb() }
     }
 
-    /// The group for one encoded picture.
-    pub fn group(&self, device: &wgpu::Device, picture: &wgpu::TextureView) -> wgpu::BindGroup {
+    /// The group for one encoded picture and the light with the depth it was made of.
+    pub fn group(&self, device: &wgpu::Device, picture: &wgpu::TextureView, diffuse: &wgpu::TextureView) -> wgpu::BindGroup {
         let sampler = fullscreen::sampler(device);
         device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("present"),
@@ -40,6 +41,7 @@ impl Presenter {
                 entry(0, self.block.as_entire_binding()),
                 entry(1, wgpu::BindingResource::TextureView(picture)),
                 entry(2, wgpu::BindingResource::Sampler(&sampler)),
+                entry(3, wgpu::BindingResource::TextureView(diffuse)),
             ],
         })
     }

@@ -1,6 +1,7 @@
 //! The key light's shadow map, and how far its light has come.
 
 use super::layouts::Layouts;
+use super::picture_texture::picture_texture;
 use super::pipelines::VERTEX_LAYOUT;
 
 /// Texels a side: a third of a millimetre on a head.
@@ -59,17 +60,7 @@ impl Shadow {
             cache: None,
         });
         let texture = |label: &str, format: wgpu::TextureFormat| {
-            device
-                .create_texture(&wgpu::TextureDescriptor {
-                    label: Some(label),
-                    size: wgpu::Extent3d { width: SIDE, height: SIDE, depth_or_array_layers: 1 },
-                    mip_level_count: 1,
-                    sample_count: 1,
-                    dimension: wgpu::TextureDimension::D2,
-                    format,
-                    usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::TEXTURE_BINDING,
-                    view_formats: &[],
-                })
+            picture_texture(device, label, [SIDE; 2], format, wgpu::TextureUsages::TEXTURE_BINDING)
                 .create_view(&wgpu::TextureViewDescriptor::default())
         };
         let sampler = device.create_sampler(&wgpu::SamplerDescriptor {

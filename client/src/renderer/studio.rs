@@ -34,9 +34,12 @@ struct Plan {
     wall: [f32; 3],
     ground: [f32; 3],
     panels: &'static [Panel],
+    /// The lamp that eyes mirror, one that stands in front of them, and how much brighter than its light its box is.
+    mirrored: (u32, f32),
 }
 
 const PORTRAIT: Plan = Plan {
+    mirrored: (0, 14.0),
     lamps: [
         ([-0.56, 0.66, 0.70], [1.0, 0.965, 0.92], 2.10),
         ([0.70, 0.12, 0.70], [0.88, 0.94, 1.0], 0.42),
@@ -54,8 +57,9 @@ const PORTRAIT: Plan = Plan {
 };
 
 const SUNSET: Plan = Plan {
+    mirrored: (1, 36.0),
     lamps: [
-        ([0.62, 0.30, -0.80], [1.0, 0.74, 0.48], 2.6),
+        ([0.62, 0.30, -0.80], [1.0, 0.74, 0.48], 2.4),
         ([-0.70, 0.35, 0.60], [0.66, 0.78, 1.0], 0.80),
         ([-0.90, 0.10, -0.50], [1.0, 0.66, 0.46], 0.55),
         ([0.20, 0.95, -0.30], [0.80, 0.88, 1.0], 0.35),
@@ -101,6 +105,11 @@ impl Studio {
         });
         lights[0].direction = self.towards_key(key_turn).extend(0.0).to_array();
         lights
+    }
+
+    /// Index of the light that wet, sharp mirrors show as a soft box, and how much brighter than its light that is.
+    pub fn mirrored(self) -> (u32, f32) {
+        self.plan().mirrored
     }
 
     /// Light that comes from `direction` (unit), the lamps left out; linear RGB.

@@ -64,7 +64,7 @@ impl Targets {
             scatter_groups: scattering.groups(device, [&diffuse, &scratch], &specular),
             tone_scattered: tone.group(device, [&diffuse, &scattered, &specular]),
             tone_plain: tone.group(device, [&diffuse, &diffuse, &specular]),
-            present_group: presenter.group(device, &picture),
+            present_group: presenter.group(device, &picture, &diffuse),
             specular_samples,
             diffuse_samples,
             depth,

@@ -52,11 +52,11 @@ pub struct Frame {
     pub skin: [f32; 4],
     /// x: largest change of haemoglobin the codes of the map of blood reach, optical density.
     pub blood: [f32; 4],
-    /// x: metres a pixel covers at a metre.
+    /// x: metres a pixel covers at a metre. y: how much brighter than its light the box is that wet mirrors show.
     pub picture: [f32; 4],
-    /// 1 for each pose the influence view shows.
+    /// 1 for each pose or zone that views of influences and masks show.
     pub shown_poses: [[f32; 4]; MAX_POSE_VECTORS],
-    /// x: 1 shows only what shines through, 2 only the blood.
+    /// x: 1 shows only what shines through, 2 only the blood. y: the light that wet mirrors show.
     pub shown: [u32; 4],
 }
 assert_layout!(Frame, frame, {
@@ -156,10 +156,16 @@ pub struct Material {
     pub roughness: f32,
     /// How much of the occlusion map counts, 0 to 1.
     pub occlusion_strength: f32,
-    /// Fills the block up.
-    pub padding: u32,
+    /// 1: the map's blue is the strength of highlights.
+    pub has_intensity: f32,
 }
-assert_layout!(Material, material, { base_color: BASE_COLOR, normal_scale: NORMAL_SCALE, roughness: ROUGHNESS, occlusion_strength: OCCLUSION_STRENGTH });
+assert_layout!(Material, material, {
+    base_color: BASE_COLOR,
+    normal_scale: NORMAL_SCALE,
+    roughness: ROUGHNESS,
+    occlusion_strength: OCCLUSION_STRENGTH,
+    has_intensity: HAS_INTENSITY,
+});
 
 /// Group 0 of the scattering draws.
 #[repr(C)]
@@ -211,10 +217,15 @@ pub struct Present {
     pub is_split: u32,
     /// 1: edges are smoothed.
     pub is_smoothed: u32,
-    /// Fills the block up.
-    pub padding: u32,
+    /// 1: alpha is coverage, else 1.
+    pub is_transparent: u32,
 }
-assert_layout!(Present, present, { target_encodes_srgb: TARGET_ENCODES_SRGB, is_split: IS_SPLIT, is_smoothed: IS_SMOOTHED });
+assert_layout!(Present, present, {
+    target_encodes_srgb: TARGET_ENCODES_SRGB,
+    is_split: IS_SPLIT,
+    is_smoothed: IS_SMOOTHED,
+    is_transparent: IS_TRANSPARENT,
+});
 
 /// The three rows of `target_from_source`.
 pub fn rows_of(transform: &Affine3A) -> [[f32; 4]; 3] {

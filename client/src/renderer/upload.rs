@@ -71,6 +71,17 @@ impl Uploader<'_> {
         self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor { label: Some(label), contents, usage })
     }
 
+    /// Layers that make an array on every back end: with OpenGL wgpu takes one layer for no array and six square ones for a
+    /// cube. What is added is never read.
+    fn as_array<'c>(&self, layers: &[&'c MipChain]) -> Vec<&'c MipChain> {
+        let mut layers = layers.to_vec();
+        let is_taken_for_another = layers.len() == 1 || layers.len().is_multiple_of(6);
+        if self.device.adapter_info().backend == wgpu::Backend::Gl && is_taken_for_another {
+            layers.extend(layers.last().copied());
+        }
+        layers
+    }
+
     /// Layers of the same size and kind as one array texture. Levels larger than the device takes are left out.
     fn texture(&mut self, label: &str, layers: &[&MipChain]) -> wgpu::Texture {
         let format = match layers[0].texels {
@@ -164,7 +175,7 @@ impl Uploader<'_> {
             Some(wrinkles) => wrinkles.layers.iter().collect(),
             None => vec![&flat],
         };
-        let maps = self.texture("wrinkle maps", &layers);
+        let maps = self.texture("wrinkle maps", &self.as_array(&layers));
         let view =
             maps.create_view(&wgpu::TextureViewDescriptor { dimension: Some(wgpu::TextureViewDimension::D2Array), ..Default::default() });
         let sampler = self.map_sampler("wrinkle sampler");
@@ -179,10 +190,10 @@ impl Uploader<'_> {
                 let masks = self.compressed_texture("zone masks", &[&zones.masks[0], &zones.masks[1]]);
                 // Without a map for stretching one layer is enough.
                 let layers: &[&MipChain] = if zones.stretch_scale > 0.0 { &[&zones.map, &zones.stretch] } else { &[&zones.map] };
-                let maps = self.compressed_texture("zone maps", layers);
+                let maps = self.compressed_texture("zone maps", &self.as_array(layers));
                 (masks, maps, zones.difference.as_ref())
             }
-            None => (self.texture("no masks", &[&no_mask, &no_mask]), self.texture("no zones", &[&flat]), None),
+            None => (self.texture("no masks", &[&no_mask, &no_mask]), self.texture("no zones", &self.as_array(&[&flat])), None),
         };
         let zone_bytes = self.bytes - before;
         let difference = self.texture("zone differences", &[difference.unwrap_or(&no_difference)]);
@@ -279,7 +290,7 @@ impl Uploader<'_> {
             normal_scale: asset.normal_scale,
             roughness: asset.roughness,
             occlusion_strength: asset.occlusion_strength,
-            padding: 0,
+            has_intensity: f32::from(u8::from(asset.has_intensity)),
         };
         let label = |what: &str| format!("{name} {what}");
         let block = self.filled(&label("material"), bytemuck::bytes_of(&block), wgpu::BufferUsages::UNIFORM);

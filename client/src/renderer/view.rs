@@ -20,6 +20,12 @@ pub enum ViewMode {
     Split,
     /// One part of the light.
     Term(Term),
+    /// Masks of the wrinkle zones over a grey face: one zone by its index as a heat map, or all in their own hues.
+    Masks(Option<usize>),
+    /// Skinning weights of the face's bones, which serve as the masks of the reference poses, each bone in its own hue.
+    BoneMasks,
+    /// The face of its expression shapes, and how far they move it as a heat map: red at 12 mm.
+    ShapeDeltas,
 }
 
 /// A part of the light, shown by itself.
@@ -70,11 +76,19 @@ impl ViewMode {
         views.extend((0..character.num_poses()).map(|k| Self::Influence(Some(k))));
         views.extend([Self::Normals, Self::Wireframe]);
         views.extend(Term::ALL.map(Self::Term));
+        if character.num_zones() > 0 {
+            views.push(Self::Masks(None));
+            views.extend((0..character.num_zones()).map(|z| Self::Masks(Some(z))));
+        }
+        views.push(Self::BoneMasks);
+        if !character.shapes.is_empty() {
+            views.push(Self::ShapeDeltas);
+        }
         views
     }
 
-    /// Reads `beauty`, `bare`, `split`, `influence`, `influence:POSE` (a pose's name), `normals`, `wireframe` or a term of
-    /// the light.
+    /// Reads `beauty`, `bare`, `split`, `influence`, `influence:POSE` (a pose's name), `normals`, `wireframe`, a term of
+    /// the light, `masks`, `masks:ZONE`, `bone-masks` or `shape-deltas`; the masks and shapes only where the character has them.
     pub fn parse(text: &str, character: &Character) -> Result<Self, ViewError> {
         let all = Self::all(character);
         all.iter().copied().find(|view| view.name(character) == text).ok_or_else(|| ViewError {
@@ -97,12 +111,28 @@ impl ViewMode {
             Self::Wireframe => "wireframe".into(),
             Self::Split => "split".into(),
             Self::Term(term) => term.name().into(),
+            Self::Masks(None) => "masks".into(),
+            Self::Masks(Some(z)) => match character.zones.as_ref().and_then(|zones| zones.list.get(z)) {
+                Some(zone) => format!("masks:{}", zone.name),
+                None => format!("masks:{z}"),
+            },
+            Self::BoneMasks => "bone-masks".into(),
+            Self::ShapeDeltas => "shape-deltas".into(),
         }
     }
 
     /// True for views of light rather than of numbers: they are scattered and toned.
     pub fn is_lit(self) -> bool {
-        !matches!(self, Self::Influence(_) | Self::Normals | Self::Wireframe | Self::Term(Term::Blood))
+        !matches!(
+            self,
+            Self::Influence(_)
+                | Self::Normals
+                | Self::Wireframe
+                | Self::Term(Term::Blood)
+                | Self::Masks(_)
+                | Self::BoneMasks
+                | Self::ShapeDeltas
+        )
     }
 }
 

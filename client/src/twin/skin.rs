@@ -16,6 +16,17 @@ pub fn highlight(normal: Vec3, view: Vec3, light: Vec3, slope: f32, f0: f32) -> 
     n_dot_l * beckmann(normal.dot(halfway), slope) * fresnel / sum.length_squared()
 }
 
+/// Twin of `masking` in `lighting.wgsl`, view and light unit: `(V·H)² / mix((V·H)², 1, slope)` (Lazarov 2011).
+pub fn masking(view: Vec3, light: Vec3, slope: f32) -> f32 {
+    let h2 = (light + view).length_squared().max(1e-4);
+    h2 / (h2 + (4.0 - h2) * slope.clamp(0.0, 1.0))
+}
+
+/// Twin of `intensity_of` in `surface.wgsl`: what a code of the map of intensity multiplies highlights by.
+pub fn intensity(code: u8, has_intensity: bool) -> f32 {
+    if has_intensity { f32::from(code) / 128.0 } else { 1.0 }
+}
+
 /// `exp(-tan²(acos x) / m²) / (m² x⁴)`: pi times Beckmann's distribution.
 fn beckmann(cos: f32, slope: f32) -> f32 {
     let x2 = (cos * cos).clamp(1e-4, 1.0);
@@ -82,6 +93,21 @@ mod tests {
         };
         let spec = highlight(Vec3::Z, tilted(-40.0), tilted(30.0), 0.3, 0.028);
         assert!((spec - 0.09424349).abs() < 1e-6, "{spec}");
+    }
+
+    #[test]
+    fn masking_leaves_light_from_the_front_and_holds_back_light_from_behind() {
+        let behind = Vec3::new(0.6, 0.0, -0.8);
+        assert!((masking(Vec3::Z, Vec3::Z, 0.7) - 1.0).abs() < 1e-6);
+        assert!((masking(Vec3::Z, behind, 0.5) - 0.1 / 0.55).abs() < 1e-6, "{}", masking(Vec3::Z, behind, 0.5));
+        assert!(masking(Vec3::Z, Vec3::NEG_Z, 0.3) < 1e-3);
+        assert!((masking(Vec3::Z, behind, 0.0) - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn intensity_is_one_in_the_middle_and_where_there_is_no_map() {
+        assert_eq!([0, 64, 128].map(|code| intensity(code, true)), [0.0, 0.5, 1.0]);
+        assert_eq!(intensity(0, false), 1.0);
     }
 
     #[test]

@@ -1,15 +1,91 @@
-//! Pages of the panel: wrinkle zones, light, skin.
+//! Pages of the panel: the face by hand, wrinkle zones, light, skin.
 
+use super::hand::{Hand, REGIONS, other_side};
 use super::look::{self, ACCENT, FAINT, TEXT, WELL};
 use super::panel::Scene;
 use super::switches::{Page, Switches};
 use crate::renderer::{DrawSettings, SkinSettings, Studio, Term, ViewMode, WrinkleSystem, ZoneBlend};
 use egui::{CornerRadius, RichText, Sense, Slider, Ui, vec2};
+use rhytid_shared::ARKIT_NAMES;
 use std::ops::RangeInclusive;
 
 /// Which page is shown.
 pub(super) fn choice(ui: &mut Ui, switches: &mut Switches) {
     row(ui, &Page::ALL, |page| page == switches.page).into_iter().for_each(|page| switches.page = page);
+}
+
+/// Sliders that pose the face in place of the stream: expressions, reference poses, and every shape by the part of the face.
+pub(super) fn hand(ui: &mut Ui, scene: &Scene<'_>, hand: &mut Hand) {
+    look::section(ui, "Who moves the face");
+    row(ui, &[(false, "Live stream"), (true, "By hand")], |is_on| is_on == hand.is_on).into_iter().for_each(|is_on| hand.is_on = is_on);
+    let note = match (hand.is_on, cfg!(feature = "embedded")) {
+        (false, _) => "A slider that is moved takes over. Nobody but this window sees it.",
+        (true, true) => "The stream goes on but is not shown. Nobody but this window sees this face.",
+        (true, false) => "Built without the server's solve: shapes move the face, bones and wrinkles stay at rest.",
+    };
+    ui.label(RichText::new(note).small().color(FAINT));
+    let before = hand.clone();
+    let mut is_mirrored = hand.is_mirrored;
+    match row(ui, &[(0, "Reset"), (1, "Random"), (2, "As live")], |_| false) {
+        Some(0) => hand.reset(),
+        Some(1) => hand.randomise(),
+        Some(_) => scene.streamed.shapes.iter().for_each(|weights| hand.take(weights)),
+        None => {}
+    }
+    if ui.checkbox(&mut is_mirrored, "Both sides alike").changed() {
+        hand.mirror(is_mirrored);
+    }
+    if let Some(zones) = scene.character.zones.as_ref().filter(|zones| !zones.expressions.is_empty()) {
+        look::section(ui, "Expressions");
+        for (row, amount) in zones.expressions.iter().zip(&mut hand.expressions) {
+            slider(ui, &row.name, amount, 0.0..=1.0);
+        }
+    }
+    if cfg!(feature = "embedded") && !scene.character.poses.is_empty() {
+        look::section(ui, "Reference poses");
+        for (pose, amount) in scene.character.poses.iter().zip(&mut hand.poses) {
+            slider(ui, &pose.name, amount, 0.0..=1.0);
+        }
+    }
+    for region in REGIONS {
+        look::section(ui, region.name);
+        for shape in region.shapes() {
+            let other = other_side(shape).filter(|_| hand.is_mirrored);
+            if other.is_some_and(|other| other < shape) {
+                continue;
+            }
+            let mut weight = hand.weights[shape];
+            slider(ui, &shape_label(ARKIT_NAMES[shape], other.is_some()), &mut weight, 0.0..=1.0);
+            if weight != hand.weights[shape] {
+                hand.set(shape, weight);
+            }
+        }
+    }
+    let is_moved = (&before.weights, &before.expressions, &before.poses) != (&hand.weights, &hand.expressions, &hand.poses);
+    hand.is_on |= is_moved;
+}
+
+/// A shape's name in words, without the part of the face it stands under: `mouthSmileLeft` is "smile L", or "smile" for both
+/// sides.
+fn shape_label(name: &str, is_both: bool) -> String {
+    let name = if is_both { name.trim_end_matches("Left").trim_end_matches("Right") } else { name };
+    let mut words = String::new();
+    for letter in name.chars() {
+        if letter.is_uppercase() {
+            words.push(' ');
+        }
+        words.extend(letter.to_lowercase());
+    }
+    let words = match words.split_once(' ') {
+        // What stands alone under its part of the face, or among shapes of another, keeps its name.
+        Some((part, rest)) if !matches!(part, "nose" | "cheek" | "tongue") => rest.to_owned(),
+        _ => words,
+    };
+    match (words.strip_suffix(" left"), words.strip_suffix(" right")) {
+        (Some(words), _) => format!("{words} L"),
+        (_, Some(words)) => format!("{words} R"),
+        _ => words,
+    }
 }
 
 /// Whose wrinkles are drawn, how the zones' are blended, and how strongly each zone shows.
@@ -21,6 +97,23 @@ pub(super) fn zones(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) {
     look::section(ui, "Blend of zones");
     let blends = [(ZoneBlend::PartialDerivatives, "Sum"), (ZoneBlend::Difference, "Difference"), (ZoneBlend::TwoMaps, "Two maps")];
     row(ui, &blends, |blend| blend == switches.draw.zone_blend).into_iter().for_each(|blend| switches.draw.zone_blend = blend);
+    look::section(ui, "Masks");
+    let mut views = vec![(ViewMode::Beauty, "None"), (ViewMode::BoneMasks, "Bones")];
+    if scene.character.zones.is_some() {
+        views.insert(1, (ViewMode::Masks(None), "Zones"));
+    }
+    let is_on = |view: ViewMode| std::mem::discriminant(&view) == std::mem::discriminant(&switches.draw.view);
+    row(ui, &views, is_on).into_iter().for_each(|view| switches.show(view));
+    if let (ViewMode::Masks(shown), Some(zones)) = (switches.draw.view, &scene.character.zones) {
+        ui.horizontal_wrapped(|ui| {
+            let of_one = zones.list.iter().enumerate().map(|(z, zone)| (Some(z), zone.name.as_str()));
+            for (zone, name) in std::iter::once((None, "all zones")).chain(of_one) {
+                if ui.add(look::switch(name, shown == zone).small()).clicked() {
+                    switches.show(ViewMode::Masks(zone));
+                }
+            }
+        });
+    }
     look::section(ui, "Zone weights");
     let Some(zones) = &scene.character.zones else {
         ui.label(RichText::new("This character has no zones.").color(FAINT));
@@ -115,4 +208,21 @@ fn bar(ui: &mut Ui, name: &str, value: f32) {
         let filled = egui::Rect::from_min_max(egui::pos2(middle.min(end), rect.top()), egui::pos2(middle.max(end), rect.bottom()));
         ui.painter().rect_filled(filled, CornerRadius::same(4), ACCENT);
     });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_are_called_by_what_they_do() {
+        assert_eq!(shape_label("mouthSmileLeft", false), "smile L");
+        assert_eq!(shape_label("mouthSmileLeft", true), "smile");
+        assert_eq!(shape_label("browInnerUp", false), "inner up");
+        assert_eq!(shape_label("noseSneerRight", true), "nose sneer");
+        assert_eq!(shape_label("jawLeft", false), "left");
+        let labels: std::collections::BTreeSet<_> =
+            REGIONS.iter().flat_map(|region| region.shapes().map(|shape| (region.name, shape_label(ARKIT_NAMES[shape], false)))).collect();
+        assert_eq!(labels.len(), rhytid_shared::NUM_ARKIT_SHAPES, "no two sliders of a part of the face are called the same");
+    }
 }

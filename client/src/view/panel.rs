@@ -19,7 +19,10 @@ const BARS_HEIGHT: f32 = 24.0;
 /// What the panel shows. Changes nothing but the switches.
 pub(crate) struct Scene<'a> {
     pub(crate) character: &'a Character,
+    /// What is drawn.
     pub(crate) frame: &'a RenderFrame,
+    /// What the stream shows.
+    pub(crate) streamed: &'a RenderFrame,
     pub(crate) status: &'a Status,
     pub(crate) room: &'a str,
     pub(crate) link: LinkStats,
@@ -79,9 +82,11 @@ fn face(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) -> Rect {
     if switches.draw.view == ViewMode::Split {
         split_captions(ui, rect);
     }
-    if scene.status.kind == StatusKind::Live {
+    if switches.hand.is_on {
+        label(ui, rect, ACCENT, "By hand · not the stream");
+    } else if scene.status.kind == StatusKind::Live {
         if !switches.has_panel {
-            pill(ui, rect, scene);
+            label(ui, rect, GOOD, &format!("{} · room {}", scene.status.headline, scene.room));
         }
     } else {
         banner(ui, rect, scene.status);
@@ -97,12 +102,14 @@ fn split_captions(ui: &Ui, rect: Rect) {
     painter.text(pos2(rect.center().x + 14.0, y), Align2::LEFT_CENTER, "without", font, TEXT.gamma_multiply(0.8));
 }
 
-/// What says that all is well, where there is no panel to say it.
-fn pill(ui: &Ui, rect: Rect, scene: &Scene<'_>) {
-    let at = rect.left_top() + vec2(22.0, 22.0);
-    ui.painter().circle_filled(at, 4.0, GOOD);
-    let text = format!("{} · room {}", scene.status.headline, scene.room);
-    ui.painter().text(at + vec2(12.0, 0.0), Align2::LEFT_CENTER, text, FontId::proportional(13.0), TEXT.gamma_multiply(0.85));
+/// A few words on a dark ground in the corner: that all is well where there is no panel to say it, or that this is no stream.
+fn label(ui: &Ui, rect: Rect, color: Color32, text: &str) {
+    let at = rect.left_top() + vec2(26.0, 26.0);
+    let galley = ui.painter().layout_no_wrap(text.to_owned(), FontId::proportional(13.0), TEXT);
+    let ground = Rect::from_min_size(at - vec2(12.0, 12.0), vec2(galley.size().x + 38.0, 24.0));
+    ui.painter().rect_filled(ground, CornerRadius::same(12), Color32::from_rgba_unmultiplied(0x12, 0x13, 0x15, 0xb0));
+    ui.painter().circle_filled(at, 4.0, color);
+    ui.painter().galley(at + vec2(12.0, -0.5 * galley.size().y), galley, TEXT);
 }
 
 /// What is the matter, large.
@@ -163,6 +170,7 @@ fn contents(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches) {
                 ui.label(RichText::new("This character has none.").color(FAINT));
             }
         }
+        Page::Hand => pages::hand(ui, scene, &mut switches.hand),
         Page::Zones => pages::zones(ui, scene, switches),
         Page::Light => pages::light(ui, switches),
         Page::Skin => pages::skin(ui, switches),
@@ -226,6 +234,13 @@ fn deformation_switches(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches)
             }
         }
     });
+    if !scene.character.shapes.is_empty() {
+        let mut is_shown = switches.draw.view == ViewMode::ShapeDeltas;
+        let hint = "The face of its shapes, and how far they move it: red is 12 mm";
+        if ui.checkbox(&mut is_shown, "Show how far shapes move it").on_hover_text(hint).changed() {
+            switches.show(if is_shown { ViewMode::ShapeDeltas } else { ViewMode::Beauty });
+        }
+    }
     let problem = match switches.draw.deform {
         Deformation::Shapes if scene.character.shapes.is_empty() => "This character has no shapes: bones move it.",
         Deformation::Shapes if scene.frame.shapes.is_none() => "No weights come with the frames: bones move the face.",
@@ -318,6 +333,6 @@ fn pose_bars(ui: &mut Ui, scene: &Scene<'_>, k: usize, name: &str) {
 }
 
 fn key_help(ui: &mut Ui) {
-    let text = "1–6 view   W wrinkles   Z whose   B blend   D deform\nL light   P page   H panel   F full screen   R camera   Esc quit\nDrag to turn, wheel to zoom";
+    let text = "1–6 view   W wrinkles   Z whose   B blend\nD deform   E by hand   L light   P page   H panel\nF full screen   R camera   Esc quit\nDrag to turn, wheel to zoom";
     ui.label(RichText::new(text).small().color(FAINT));
 }

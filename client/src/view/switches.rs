@@ -1,5 +1,6 @@
 //! What the person before the window has chosen.
 
+use super::hand::Hand;
 use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, Studio, ViewMode, WrinkleSystem};
 use egui::{Key, Modifiers};
 use rhytid_shared::Character;
@@ -11,6 +12,8 @@ pub(crate) struct Switches {
     pub(crate) draw: DrawSettings,
     /// The pose the influence view shows, all where `None`; kept while another view is on.
     pub(crate) pose: Option<usize>,
+    /// The face by hand.
+    pub(crate) hand: Hand,
     /// What the lower part of the panel shows.
     pub(crate) page: Page,
     /// The panel is there.
@@ -26,6 +29,8 @@ pub(crate) struct Switches {
 pub(crate) enum Page {
     /// Numbers of the link and bars of the reference poses.
     Face,
+    /// The face by hand.
+    Hand,
     /// Wrinkle zones.
     Zones,
     /// Lights and the picture.
@@ -36,8 +41,8 @@ pub(crate) enum Page {
 
 impl Page {
     /// In the order of the switches.
-    pub(crate) const ALL: [(Self, &'static str); 4] =
-        [(Self::Face, "Face"), (Self::Zones, "Zones"), (Self::Light, "Light"), (Self::Skin, "Skin")];
+    pub(crate) const ALL: [(Self, &'static str); 5] =
+        [(Self::Face, "Face"), (Self::Hand, "Hand"), (Self::Zones, "Zones"), (Self::Light, "Light"), (Self::Skin, "Skin")];
 }
 
 /// Radians the camera turns for a drag over the height of the picture.
@@ -62,6 +67,7 @@ impl Switches {
         Self {
             draw: DrawSettings::new(Camera::front(character)),
             pose: None,
+            hand: Hand::default(),
             page: Page::Face,
             has_panel: true,
             is_full_screen: false,
@@ -97,6 +103,9 @@ impl Switches {
         if pressed(Key::Z) {
             let at = WrinkleSystem::ALL.iter().position(|&system| system == self.draw.system).unwrap_or(0);
             self.draw.system = WrinkleSystem::ALL[(at + 1) % WrinkleSystem::ALL.len()];
+        }
+        if pressed(Key::E) {
+            self.hand.is_on = !self.hand.is_on;
         }
         if pressed(Key::P) {
             let at = Page::ALL.iter().position(|(page, _)| *page == self.page).unwrap_or(0);
@@ -161,8 +170,12 @@ impl Switches {
         if self.pose.is_some_and(|pose| pose >= character.num_poses()) {
             self.pose = None;
         }
-        if let ViewMode::Influence(_) = self.draw.view {
-            self.draw.view = ViewMode::Influence(self.pose);
+        match self.draw.view {
+            ViewMode::Influence(_) => self.draw.view = ViewMode::Influence(self.pose),
+            ViewMode::Masks(_) if character.num_zones() == 0 => self.draw.view = ViewMode::Beauty,
+            ViewMode::Masks(_) => self.draw.view = ViewMode::Masks(None),
+            ViewMode::ShapeDeltas if character.shapes.is_empty() => self.draw.view = ViewMode::Beauty,
+            _ => {}
         }
     }
 }
@@ -232,8 +245,9 @@ mod tests {
         assert_eq!(desk.press(Key::D).draw.deform, Deformation::Shapes);
         assert_eq!(desk.press(Key::L).draw.studio, Studio::Sunset);
         assert_eq!(desk.press(Key::Z).draw.system, WrinkleSystem::Bones);
-        assert_eq!(desk.press(Key::P).page, Page::Zones);
-        for key in [Key::W, Key::D, Key::H, Key::F, Key::L, Key::Z, Key::Z, Key::Z, Key::P, Key::P, Key::P] {
+        assert_eq!(desk.press(Key::P).page, Page::Hand);
+        assert!(desk.press(Key::E).hand.is_on);
+        for key in [Key::W, Key::D, Key::H, Key::F, Key::L, Key::E, Key::Z, Key::Z, Key::Z, Key::P, Key::P, Key::P, Key::P] {
             desk.press(key);
         }
         assert_eq!(desk.switches, before, "pressed again they switch back");

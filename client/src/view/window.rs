@@ -6,7 +6,7 @@ use super::painter::Painter;
 use super::panel::{self, Scene};
 use super::switches::Switches;
 use crate::asset::CharacterAsset;
-use crate::renderer::{RenderError, RenderFrame, Renderer, optional_features, read_back, required_limits};
+use crate::renderer::{RenderError, RenderFrame, Renderer, optional_features, picture_texture, read_back, required_limits};
 use image::RgbaImage;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -234,17 +234,7 @@ impl GpuWindow {
     pub(super) fn screenshot(&mut self, scene: &Scene<'_>, switches: &mut Switches) -> Result<RgbaImage, WindowError> {
         let (primitives, pixels_per_point, freed) = self.lay_out(scene, switches);
         let size = [self.surface_config.width, self.surface_config.height];
-        let extent = wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 };
-        let texture = self.device.create_texture(&wgpu::TextureDescriptor {
-            label: Some("screenshot"),
-            size: extent,
-            mip_level_count: 1,
-            sample_count: 1,
-            dimension: wgpu::TextureDimension::D2,
-            format: self.surface_config.format,
-            usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
-            view_formats: &[],
-        });
+        let texture = picture_texture(&self.device, "screenshot", size, self.surface_config.format, wgpu::TextureUsages::COPY_SRC);
         let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
         let encoder = self.record(&view, &primitives, pixels_per_point, scene.frame, switches);
         let mut picture = read_back(&self.device, &self.queue, encoder, &texture, size)?;
@@ -318,16 +308,7 @@ fn watch(device: &wgpu::Device) -> Arc<AtomicBool> {
 
 impl FaceTexture {
     fn new(device: &wgpu::Device, painter: &mut Painter, size: [u32; 2], id: Option<egui::TextureId>) -> Self {
-        let texture = device.create_texture(&wgpu::TextureDescriptor {
-            label: Some("face in the window"),
-            size: wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 },
-            mip_level_count: 1,
-            sample_count: 1,
-            dimension: wgpu::TextureDimension::D2,
-            format: FACE_FORMAT,
-            usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::TEXTURE_BINDING,
-            view_formats: &[],
-        });
+        let texture = picture_texture(device, "face in the window", size, FACE_FORMAT, wgpu::TextureUsages::TEXTURE_BINDING);
         let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
         let id = painter.register(device, &view, id);
         Self { view, size, id }

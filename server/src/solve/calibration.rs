@@ -10,8 +10,7 @@ use super::depth::{self, Shape};
 use super::head_pose::{self, Pose};
 use super::rotation;
 use glam::{DQuat, DVec2, DVec3};
-use rhytid_shared::NUM_ARKIT_SHAPES;
-use serde::{Deserialize, Serialize};
+use rhytid_shared::{Calibration, NUM_ARKIT_SHAPES};
 
 /// Frames are kept no denser than this, seconds, at first: a 240 Hz tracker adds nothing a 30 Hz one does not.
 const SPACING: f64 = 0.025;
@@ -28,66 +27,42 @@ const FARTHEST: f64 = 1.0;
 /// When the session is looked at again, seconds of a face seen.
 const LOOKS: [f64; 5] = [5.0, 10.0, 20.0, 40.0, 80.0];
 
-/// A neutral face as it was calibrated: kept with a session so that a replay is exact.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Calibration {
-    /// Sender's time at which it was reached, seconds.
-    pub t: f64,
-    /// Frames it is the median of.
-    pub num_frames: usize,
-    /// Root-mean-square landmark speed over those frames, interocular distances a second.
-    pub speed: f64,
-    /// True where the publisher asked for it.
-    pub requested: bool,
-    /// The performer's neutral points (68 for iBUG and what maps onto it, with two irises after them where the layout
-    /// has them; the sender's own otherwise), head space, metres at the character's scale. Empty for senders of weights.
-    pub points: Vec<[f64; 3]>,
-    /// Head rotation at neutral, `camera_from_head` as a quaternion (x, y, z, w).
-    pub head_rotation: [f64; 4],
-    /// Where the character's head pivot was at neutral, metres in the camera's frame.
-    pub head_position: [f64; 3],
-    /// Expression weights at neutral, for senders of weights that asked to be calibrated.
-    pub weights: Option<Vec<f32>>,
+/// The neutral of a sender of weights (or of bones, which need none).
+pub(super) fn of_weights(t: f64, weights: Option<&[f32; NUM_ARKIT_SHAPES]>, head_rotation: DQuat, head_position: DVec3) -> Calibration {
+    Calibration {
+        t,
+        num_frames: 1,
+        speed: 0.0,
+        requested: true,
+        points: Vec::new(),
+        head_rotation: head_rotation.to_array(),
+        head_position: head_position.to_array(),
+        weights: weights.map(|weights| weights.to_vec()),
+    }
 }
 
-impl Calibration {
-    /// The neutral of a sender of weights (or of bones, which need none).
-    pub(super) fn of_weights(t: f64, weights: Option<&[f32; NUM_ARKIT_SHAPES]>, head_rotation: DQuat, head_position: DVec3) -> Self {
-        Self {
-            t,
-            num_frames: 1,
-            speed: 0.0,
-            requested: true,
-            points: Vec::new(),
-            head_rotation: head_rotation.to_array(),
-            head_position: head_position.to_array(),
-            weights: weights.map(|weights| weights.to_vec()),
-        }
+/// Why `calibration` cannot be that of a session with `num_points` points, if so. `pivot` is the character's head's.
+pub(super) fn problem(calibration: &Calibration, num_points: usize, pivot: DVec3) -> Option<String> {
+    if !calibration.points.is_empty() && calibration.points.len() != num_points {
+        return Some(format!("has {} points, expected {num_points}", calibration.points.len()));
     }
-
-    /// Why this cannot be the calibration of a session with `num_points` points, if so. `pivot` is the character's head's.
-    pub(super) fn problem(&self, num_points: usize, pivot: DVec3) -> Option<String> {
-        if !self.points.is_empty() && self.points.len() != num_points {
-            return Some(format!("has {} points, expected {num_points}", self.points.len()));
-        }
-        if self.weights.as_ref().is_some_and(|weights| weights.len() != NUM_ARKIT_SHAPES) {
-            return Some(format!("has other than {NUM_ARKIT_SHAPES} weights"));
-        }
-        let numbers = self.points.iter().flatten().chain(&self.head_rotation).chain(&self.head_position);
-        let are_finite = numbers.copied().all(f64::is_finite) && self.weights.iter().flatten().all(|weight| weight.is_finite());
-        let rotation = DQuat::from_array(self.head_rotation);
-        if !are_finite || (rotation.length() - 1.0).abs() > 1e-3 {
-            return Some("holds values that are not finite or a rotation that is none".to_owned());
-        }
-        if let Some(i) = self.points.iter().position(|point| point.iter().any(|value| value.abs() > FARTHEST)) {
-            return Some(format!("has points[{i}] at {:?}, expected within ±{FARTHEST} m of the origin of head space", self.points[i]));
-        }
-        let pose = Pose { rotation, translation: DVec3::from(self.head_position) - rotation::rotate(rotation, pivot) };
-        let matrix = pose.matrix();
-        let is_before = |point: &[f64; 3]| (matrix * DVec3::from(*point) + pose.translation).z > 0.0;
-        (!self.points.iter().all(is_before))
-            .then(|| format!("has the head at {:?}, expected all of it before the camera", self.head_position))
+    if calibration.weights.as_ref().is_some_and(|weights| weights.len() != NUM_ARKIT_SHAPES) {
+        return Some(format!("has other than {NUM_ARKIT_SHAPES} weights"));
     }
+    let numbers = calibration.points.iter().flatten().chain(&calibration.head_rotation).chain(&calibration.head_position);
+    let are_finite = numbers.copied().all(f64::is_finite) && calibration.weights.iter().flatten().all(|weight| weight.is_finite());
+    let rotation = DQuat::from_array(calibration.head_rotation);
+    if !are_finite || (rotation.length() - 1.0).abs() > 1e-3 {
+        return Some("holds values that are not finite or a rotation that is none".to_owned());
+    }
+    if let Some(i) = calibration.points.iter().position(|point| point.iter().any(|value| value.abs() > FARTHEST)) {
+        return Some(format!("has points[{i}] at {:?}, expected within ±{FARTHEST} m of the origin of head space", calibration.points[i]));
+    }
+    let pose = Pose { rotation, translation: DVec3::from(calibration.head_position) - rotation::rotate(rotation, pivot) };
+    let matrix = pose.matrix();
+    let is_before = |point: &[f64; 3]| (matrix * DVec3::from(*point) + pose.translation).z > 0.0;
+    (!calibration.points.iter().all(is_before))
+        .then(|| format!("has the head at {:?}, expected all of it before the camera", calibration.head_position))
 }
 
 /// What is kept of a frame besides its rays.

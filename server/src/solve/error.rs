@@ -56,6 +56,12 @@ pub enum SolveError {
     /// Landmarks in a session whose hello named no layout.
     #[error("frame has landmarks, but hello.layout is missing")]
     NoLayout,
+    /// A feed that asks for a profile by name.
+    #[error("profile {name:?} is asked for by its name, which only a server with a folder of profiles knows")]
+    NamedProfile {
+        /// The name.
+        name: String,
+    },
     /// Time stood still, went back, or on by less than a packet can tell.
     #[error("t is {got} s, expected a microsecond or more after the frame before it, {previous} s")]
     Time {

@@ -287,7 +287,7 @@ impl ExpressionMap {
     }
 
     /// As [`Self::fit`], which takes tens of milliseconds: sessions of one character share what the first of them made.
-    fn shared(character: &Arc<Character>) -> Option<Arc<Self>> {
+    pub(super) fn shared(character: &Arc<Character>) -> Option<Arc<Self>> {
         type Known = Vec<(Weak<Character>, Option<Arc<ExpressionMap>>)>;
         static KNOWN: Mutex<Known> = Mutex::new(Vec::new());
         // What a panic elsewhere left behind is whole: entries are pushed at the end.
@@ -519,5 +519,21 @@ impl Solution {
             }
         }
         sums
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rhytid_shared::DEFAULT_CHARACTER_GLB;
+
+    #[test]
+    fn sessions_of_a_prepared_character_share_what_was_prepared() {
+        let character = Arc::new(Character::from_glb(DEFAULT_CHARACTER_GLB).expect("the built-in character is whole"));
+        crate::solve::prepare(&character, &crate::solve::SolveConfig::default());
+        let [first, second] = [0, 1].map(|_| ExpressionMap::shared(&character).expect("it has shapes"));
+        assert!(Arc::ptr_eq(&first, &second));
+        let other = Arc::new(Character::clone(&character));
+        assert!(!Arc::ptr_eq(&first, &ExpressionMap::shared(&other).expect("it has shapes")), "another character is another");
     }
 }

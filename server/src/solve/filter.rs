@@ -40,6 +40,11 @@ impl OneEuroBank {
         }
     }
 
+    /// Smooths with other parameters from the next sample on.
+    pub(super) fn set_config(&mut self, config: OneEuroConfig) {
+        self.config = config;
+    }
+
     /// Forgets the past: the next sample passes as it is.
     pub fn reset(&mut self) {
         self.has_value = false;

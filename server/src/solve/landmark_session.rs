@@ -1,8 +1,8 @@
 //! One performer's landmarks through a session: head pose, neutral, smoothing, retargeting.
 
 use super::DelayReport;
-use super::calibration::{self, Calibration, Calibrator, Found, ibug_strain};
-use super::config::SolveConfig;
+use super::calibration::{self, Calibrator, Found, ibug_strain};
+use super::config::{FilterConfig, SolveConfig};
 use super::depth::Shape;
 use super::easing::FaceState;
 use super::error::SolveError;
@@ -17,7 +17,7 @@ use super::rotation;
 use glam::{DQuat, DVec2, DVec3};
 use rhytid_shared::layout::Layout;
 use rhytid_shared::limits::MAX_HEAD_TRAVEL;
-use rhytid_shared::{Character, PublishHello};
+use rhytid_shared::{Calibration, Character, PublishHello};
 use std::sync::Arc;
 
 /// A head pose that fits badly is refused for this long, seconds; what lasts longer is no outlier.
@@ -69,6 +69,10 @@ pub(super) struct LandmarkSession {
     calibrator: Calibrator,
     calibration: Option<Calibration>,
     retarget: Option<Retarget>,
+    /// Head rotation and place that count as straight ahead, where the publisher has said so since the neutral.
+    centre: Option<(DQuat, DVec3)>,
+    /// The next face looks straight ahead.
+    is_centre_wanted: bool,
     /// Where weights are wanted and can be told.
     estimator: Option<Estimator>,
 }
@@ -131,6 +135,8 @@ impl LandmarkSession {
             calibrator: Calibrator::new(&config.calibration, num, points.is_ibug.then_some(ibug_strain)),
             calibration: None,
             retarget: None,
+            centre: None,
+            is_centre_wanted: false,
             estimator: if config.estimate_weights { Estimator::new(character, &points) } else { None },
             prior: model.iter().map(|point| point.z).collect(),
             believed_spread: (0..num)
@@ -182,6 +188,9 @@ impl LandmarkSession {
         let is_requested = found.is_awaited && found.calibration.requested;
         let is_adopted = self.adopt(character, found.calibration).is_ok();
         if is_adopted {
+            if is_requested {
+                (self.centre, self.is_centre_wanted) = (None, false);
+            }
             self.calibrator.accepted(is_requested);
         } else {
             self.calibrator.refused(t, is_requested);
@@ -216,6 +225,27 @@ impl LandmarkSession {
     /// The tracker lost the face.
     pub(super) fn interrupt(&mut self) {
         self.calibrator.interrupt();
+    }
+
+    /// Smooths with other parameters from the next frame on.
+    pub(super) fn set_filter(&mut self, filter: &FilterConfig) {
+        self.brows.bank.set_config(filter.brows);
+        self.eyelids.bank.set_config(filter.eyelids);
+        self.mouth.bank.set_config(filter.mouth);
+        self.head.set_config(filter.head);
+    }
+
+    /// The head's present pose is straight ahead, until a neutral is asked for; false where no face has been seen.
+    pub(super) fn recentre(&mut self) -> bool {
+        let Some(pose) = self.pose else { return false };
+        self.centre = Some((pose.rotation, calibration::pivot_of(&pose, self.pivot)));
+        self.head.reset();
+        true
+    }
+
+    /// As [`Self::recentre`], with the next face.
+    pub(super) fn recentre_next(&mut self) {
+        self.is_centre_wanted = true;
     }
 
     pub(super) fn added_delay(&self) -> DelayReport {
@@ -264,6 +294,10 @@ impl LandmarkSession {
                 }
             }
             self.settle();
+        }
+        if self.is_centre_wanted && !is_refused {
+            self.is_centre_wanted = false;
+            self.recentre();
         }
         self.smooth(dt);
         if let Some(retarget) = &mut self.retarget {
@@ -384,10 +418,12 @@ impl LandmarkSession {
     /// Head rotation and the pivot's way since neutral, smoothed.
     fn write_head(&mut self, dt: f64, state: &mut FaceState) {
         let (Some(pose), Some(calibration)) = (self.pose, &self.calibration) else { return };
-        let neutral_from_camera = DQuat::from_array(calibration.head_rotation).inverse();
+        let at_neutral = (DQuat::from_array(calibration.head_rotation), DVec3::from(calibration.head_position));
+        let (rotation, position) = self.centre.unwrap_or(at_neutral);
+        let neutral_from_camera = rotation.inverse();
         let turn = rotation::to_vector((neutral_from_camera * pose.rotation).normalize());
         let pivot = calibration::pivot_of(&pose, self.pivot);
-        let shift = rotation::rotate(neutral_from_camera, pivot - DVec3::from(calibration.head_position)) / HEAD_RADIUS;
+        let shift = rotation::rotate(neutral_from_camera, pivot - position) / HEAD_RADIUS;
         let smoothed = self.head.update(&[turn.x, turn.y, turn.z, shift.x, shift.y, shift.z], dt);
         let farthest = f64::from(MAX_HEAD_TRAVEL);
         for axis in 0..3 {

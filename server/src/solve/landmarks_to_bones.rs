@@ -9,6 +9,7 @@ use super::lids::{LidMeasure, lid_pitch};
 use super::points::{LEFT_EYE, PointSet, RIGHT_EYE};
 use super::rbf::Regression;
 use super::rotation;
+use super::skeleton::travel_of;
 use glam::{DVec2, DVec3, Vec3};
 use rhytid_shared::Character;
 use rhytid_shared::character::{Drive, Side};
@@ -66,11 +67,22 @@ enum Driver {
     Still,
 }
 
+/// A bone of the skin that the jaw carries: its gain is on what it does beyond that, else lips would outrun the chin.
+#[derive(Debug, Clone, Copy)]
+struct Carried {
+    bone: usize,
+    jaw: usize,
+    /// From the jaw's hinge, metres.
+    arm: Vec3,
+    gain: Vec3,
+}
+
 /// The map from one performer to the character, fixed at calibration.
 pub(super) struct Retarget {
     map: Regression,
     slots: Vec<Slot>,
     drivers: Vec<Driver>,
+    carried: Vec<Carried>,
     /// Right, left.
     lids: Option<[LidMeasure; 2]>,
     gazes: Option<[GazeMeasure; 2]>,
@@ -102,8 +114,10 @@ impl Retarget {
                 .collect()
         };
         let index = |side: Side| usize::from(side == Side::Left);
+        let carried: Vec<Carried> = (0..character.num_bones()).filter_map(|bone| Carried::new(character, bone)).collect();
+        let is_carried = |bone: usize| carried.iter().any(|carried| carried.bone == bone);
         let mut drivers = Vec::with_capacity(character.num_bones());
-        for (bone, shares) in character.bones.iter().zip(&points.shares) {
+        for (i, (bone, shares)) in character.bones.iter().zip(&points.shares).enumerate() {
             let arm = |pivot: Vec3| (bone.rest - pivot).as_dvec3();
             let gain = f64::from(bone.gain.x);
             let arc = |shares, pivot, pitch: [f32; 2], yaw: f32| Driver::Arc {
@@ -114,7 +128,7 @@ impl Retarget {
                 yaw: f64::from(yaw),
             };
             drivers.push(match bone.drive {
-                Drive::Skin { .. } => Driver::Skin { shares: slots_of(shares), gain: bone.gain },
+                Drive::Skin { .. } => Driver::Skin { shares: slots_of(shares), gain: if is_carried(i) { Vec3::ONE } else { bone.gain } },
                 Drive::Jaw { pivot, max_angle, .. } => {
                     Driver::Jaw { shares: slots_of(shares), gain, max_angle: f64::from(max_angle), arm: arm(pivot) }
                 }
@@ -137,13 +151,13 @@ impl Retarget {
             [(RIGHT_EYE, irises[0]), (LEFT_EYE, irises[1])].map(|(eye, iris)| GazeMeasure::new(eye, iris, neutral))
         });
         let displacements = vec![Vec3::ZERO; slots.len()];
-        Ok(Self { map, slots, drivers, lids, gazes, displacements })
+        Ok(Self { map, slots, drivers, carried, lids, gazes, displacements })
     }
 
     /// Writes each bone's motion: a displacement in metres, or pitch and yaw in radians for bones that turn.
     pub(super) fn solve(&mut self, points: &[DVec2], motions: &mut [Vec3]) {
         self.displace(points);
-        for (driver, motion) in self.drivers.iter().zip(motions) {
+        for (driver, motion) in self.drivers.iter().zip(motions.iter_mut()) {
             *motion = match driver {
                 Driver::Skin { shares, gain } => *gain * self.mean(shares),
                 Driver::Jaw { shares, gain, max_angle, arm } => {
@@ -165,6 +179,11 @@ impl Retarget {
                 Driver::Still => Vec3::ZERO,
             };
         }
+        for carried in &self.carried {
+            let by_jaw = travel_of(carried.arm, motions[carried.jaw]);
+            let motion = &mut motions[carried.bone];
+            *motion = by_jaw + carried.gain * (*motion - by_jaw);
+        }
     }
 
     fn mean(&self, shares: &[(usize, f32)]) -> Vec3 {
@@ -183,6 +202,20 @@ impl Retarget {
                 let beyond = (moved - within).as_vec2();
                 self.map.value(slot.neutral + within) - slot.value + slot.slope[0] * beyond.x + slot.slope[1] * beyond.y
             };
+        }
+    }
+}
+
+impl Carried {
+    /// Nothing where the jaw does not carry the bone, or its gain changes nothing.
+    fn new(character: &Character, index: usize) -> Option<Self> {
+        let bone = &character.bones[index];
+        let jaw = bone.turns_with?;
+        match (&bone.drive, &character.bones[jaw].drive) {
+            (Drive::Skin { .. }, Drive::Jaw { pivot, .. }) if bone.gain != Vec3::ONE => {
+                Some(Self { bone: index, jaw, arm: bone.rest - *pivot, gain: bone.gain })
+            }
+            _ => None,
         }
     }
 }

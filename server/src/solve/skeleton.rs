@@ -111,7 +111,7 @@ impl Skeleton {
 }
 
 /// How far pitch, yaw (radians) and stretch (fraction of its length) carry the end of `arm`.
-fn travel_of(arm: Vec3, motion: Vec3) -> Vec3 {
+pub(super) fn travel_of(arm: Vec3, motion: Vec3) -> Vec3 {
     let turn = rotation::from_pitch_yaw(f64::from(motion.x), f64::from(motion.y));
     let arm = arm.as_dvec3();
     let mut end = rotation::rotate(turn, arm);

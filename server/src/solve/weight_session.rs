@@ -1,15 +1,16 @@
 //! One sender's expression weights through a session: mirroring, neutral, smoothing, bones.
 
-use super::calibration::Calibration;
-use super::config::SolveConfig;
+use super::config::{OneEuroConfig, SolveConfig};
 use super::easing::FaceState;
 use super::error::SolveError;
 use super::filter::OneEuroBank;
+use super::mix::group_of_shape;
+use super::ranges::stretched;
 use super::rotation;
 use super::weights_to_bones::{WeightRig, Weights};
 use glam::{DQuat, DVec3};
 use rhytid_shared::limits::MAX_HEAD_TRAVEL;
-use rhytid_shared::{ARKIT_NAMES, ArkitShape, Character, HeadPose, NUM_ARKIT_SHAPES};
+use rhytid_shared::{ARKIT_NAMES, ArkitShape, Calibration, ChannelGroup, Character, HeadPose, NUM_ARKIT_SHAPES};
 
 /// Largest weight a tracker may give: some overshoot on strong faces.
 const LARGEST_WEIGHT: f32 = 1.2;
@@ -18,27 +19,54 @@ const LARGEST_NEUTRAL: f32 = 0.5;
 
 pub(super) struct WeightSession {
     rig: WeightRig,
-    bank: OneEuroBank,
-    samples: Box<[f64; NUM_ARKIT_SHAPES]>,
+    /// Brows, eyes and the rest, each with its shapes.
+    banks: [(OneEuroBank, Vec<usize>); 3],
+    samples: Vec<f64>,
     /// The shape each shape is read from: itself, or its partner on the other side.
     source_of: Option<Box<[usize; NUM_ARKIT_SHAPES]>>,
     neutral: Box<Weights>,
     last_t: Option<f64>,
     /// As the sender gave them last.
     last: Option<Box<Weights>>,
+    /// Smoothed, about the neutral, before they are stretched.
+    seen: Box<Weights>,
+    /// What each weight is stretched by.
+    factors: Box<Weights>,
 }
 
 impl WeightSession {
     pub(super) fn new(character: &Character, config: &SolveConfig) -> Self {
         Self {
             rig: WeightRig::new(character),
-            bank: OneEuroBank::new(config.filter.weights, NUM_ARKIT_SHAPES, 1.0),
-            samples: Box::new([0.0; NUM_ARKIT_SHAPES]),
+            banks: [&[ChannelGroup::Brows][..], &[ChannelGroup::Lids, ChannelGroup::Gaze], &[ChannelGroup::Mouth, ChannelGroup::Head]].map(
+                |groups| {
+                    let shapes: Vec<usize> = (0..NUM_ARKIT_SHAPES).filter(|&i| groups.contains(&group_of_shape(ARKIT_NAMES[i]))).collect();
+                    (OneEuroBank::new(config.filter.weights, shapes.len(), 1.0), shapes)
+                },
+            ),
+            samples: Vec::with_capacity(NUM_ARKIT_SHAPES),
             source_of: config.mirror.then(|| Box::new(std::array::from_fn(other_side))),
             neutral: Box::new([0.0; NUM_ARKIT_SHAPES]),
             last_t: None,
             last: None,
+            seen: Box::new([0.0; NUM_ARKIT_SHAPES]),
+            factors: Box::new([1.0; NUM_ARKIT_SHAPES]),
         }
+    }
+
+    /// What moves the bones.
+    pub(super) fn rig(&self) -> &WeightRig {
+        &self.rig
+    }
+
+    /// Stretches each weight from the next frame on.
+    pub(super) fn set_factors(&mut self, factors: &Weights) {
+        *self.factors = *factors;
+    }
+
+    /// The last frame's weights, smoothed, about the neutral, before they are stretched.
+    pub(super) fn seen(&self) -> &Weights {
+        &self.seen
     }
 
     pub(super) fn restore(&mut self, neutral: &[f32]) {
@@ -56,9 +84,29 @@ impl WeightSession {
         Some(&self.neutral)
     }
 
-    /// Delay that the smoothing adds at present, seconds.
-    pub(super) fn added_delay(&self) -> f64 {
-        self.bank.delay()
+    /// Delays that the smoothing adds at present, seconds: brows, eyes, the rest.
+    pub(super) fn added_delays(&self) -> [f64; 3] {
+        [0, 1, 2].map(|group| self.banks[group].0.delay())
+    }
+
+    /// Smooths brows, eyes and the rest with other parameters from the next frame on.
+    pub(super) fn set_filters(&mut self, filters: [OneEuroConfig; 3]) {
+        for ((bank, _), filter) in self.banks.iter_mut().zip(filters) {
+            bank.set_config(filter);
+        }
+    }
+
+    /// Swaps the sides of the shapes that trackers disagree about, and of all where `mirror` says so.
+    pub(super) fn set_sides(&mut self, mirror: bool, swap_jaw: bool, swap_mouth: bool) {
+        let source = |shape: usize| {
+            let is_swapped = match ARKIT_NAMES[shape] {
+                "jawLeft" | "jawRight" => mirror != swap_jaw,
+                "mouthLeft" | "mouthRight" => mirror != swap_mouth,
+                _ => mirror,
+            };
+            if is_swapped { other_side(shape) } else { shape }
+        };
+        self.source_of = (mirror || swap_jaw || swap_mouth).then(|| Box::new(std::array::from_fn(source)));
     }
 
     pub(super) fn solve(&mut self, t: f64, weights: &Weights, state: &mut FaceState) -> Result<(), SolveError> {
@@ -69,18 +117,27 @@ impl WeightSession {
             let source = self.source_of.as_ref().map_or(shape, |table| table[shape]);
             weights[source].clamp(0.0, LARGEST_WEIGHT)
         });
-        for shape in 0..NUM_ARKIT_SHAPES {
-            let neutral = self.neutral[shape];
-            self.samples[shape] = f64::from(((seen[shape] - neutral) / (1.0 - neutral)).max(0.0));
-        }
         let dt = self.last_t.map_or(f64::INFINITY, |last| t - last);
-        let smoothed = self.bank.update(&self.samples[..], dt);
-        let smoothed: Weights = std::array::from_fn(|shape| smoothed[shape] as f32);
+        let mut smoothed: Weights = [0.0; NUM_ARKIT_SHAPES];
+        for (bank, shapes) in &mut self.banks {
+            self.samples.clear();
+            self.samples.extend(shapes.iter().map(|&shape| {
+                let neutral = self.neutral[shape];
+                f64::from(((seen[shape] - neutral) / (1.0 - neutral)).max(0.0))
+            }));
+            for (&shape, value) in shapes.iter().zip(bank.update(&self.samples, dt)) {
+                smoothed[shape] = *value as f32;
+            }
+        }
         match &mut self.last {
             Some(last) => **last = seen,
             None => self.last = Some(Box::new(seen)),
         }
         self.last_t = Some(t);
+        *self.seen = smoothed;
+        for (weight, factor) in smoothed.iter_mut().zip(self.factors.iter()) {
+            *weight = stretched(*weight, *factor, 1.0);
+        }
         self.rig.solve(&smoothed, &mut state.motions);
         state.weights = Some(smoothed.map(|weight| weight.clamp(0.0, 1.0)));
         state.is_placed = false;
@@ -106,11 +163,13 @@ pub(super) struct SentHead {
     neutral_rotation: DQuat,
     neutral_position: DVec3,
     last: Option<(DQuat, DVec3)>,
+    /// The next head looks straight ahead.
+    is_centre_wanted: bool,
 }
 
 impl SentHead {
     pub(super) fn new(mirror: bool) -> Self {
-        Self { mirror, neutral_rotation: DQuat::IDENTITY, neutral_position: DVec3::ZERO, last: None }
+        Self { mirror, neutral_rotation: DQuat::IDENTITY, neutral_position: DVec3::ZERO, last: None, is_centre_wanted: false }
     }
 
     pub(super) fn restore(&mut self, calibration: &Calibration) {
@@ -124,6 +183,11 @@ impl SentHead {
             (self.neutral_rotation, self.neutral_position) = (rotation, position);
         }
         (self.neutral_rotation, self.neutral_position)
+    }
+
+    /// Takes the next head as neutral.
+    pub(super) fn recentre_next(&mut self) {
+        self.is_centre_wanted = true;
     }
 
     /// Checks a head before anything is changed by its frame.
@@ -150,6 +214,9 @@ impl SentHead {
             p.x = -p.x;
         }
         self.last = Some((q, p));
+        if std::mem::take(&mut self.is_centre_wanted) {
+            self.calibrate();
+        }
         let back = self.neutral_rotation.inverse();
         let turn = rotation::to_vector(back * q);
         let shift = rotation::rotate(back, p - self.neutral_position);

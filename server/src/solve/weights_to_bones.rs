@@ -13,6 +13,13 @@ const WORST_CONDITION: f64 = 1e6;
 /// Share of the jaw's widest angle that `jawOpen` gives a character without that shape.
 const DEFAULT_JAW_OPEN: f32 = 0.7;
 
+/// How much of a lid's way with the gaze is left to the gaze's weights: what trackers call a blink holds the rest of it.
+const FOLLOWS_GAZE: f32 = 0.6;
+/// How far the upper lid sinks in a squint, as a share of its way to shut, and how far the lower one rises, in angles that
+/// it turns in a blink: there the upper lid does nearly everything. By what a tracker reads of the character.
+const SQUINT_SINKS: f32 = 0.10;
+const SQUINT_RISES: f32 = 4.0;
+
 /// Expression weights in the order of [`ARKIT_NAMES`].
 pub(super) type Weights = [f32; NUM_ARKIT_SHAPES];
 
@@ -29,6 +36,10 @@ pub(super) struct WeightRig {
     responses: Vec<Response>,
     correctives: Option<Correctives>,
     limits: Vec<Limit>,
+    /// Squint and blink of each eye.
+    lid_shapes: [[usize; 2]; 2],
+    /// What lifts the lower lip against the upper one.
+    lip_lifts: [usize; 2],
 }
 
 /// Range of a bone's motion.
@@ -57,16 +68,29 @@ impl WeightRig {
         }
         responses.retain(|response| response.motions.iter().any(|motion| *motion != Vec3::ZERO));
         let limits = character.bones.iter().map(|bone| limit_of(&bone.drive)).collect();
-        let mut rig = Self { responses, correctives: None, limits };
+        let index = |name: &str| ARKIT_NAMES.iter().position(|known| *known == name).unwrap_or(0);
+        let lid_shapes = [["eyeSquintLeft", "eyeBlinkLeft"], ["eyeSquintRight", "eyeBlinkRight"]].map(|pair| pair.map(index));
+        let lip_lifts = ["mouthRollLower", "mouthShrugLower"].map(index);
+        let mut rig = Self { responses, correctives: None, limits, lid_shapes, lip_lifts };
         rig.correctives = Correctives::new(character, &rig);
         rig
     }
 
     /// Writes each bone's motion: a displacement in metres, or pitch and yaw in radians for bones that turn.
     pub(super) fn solve(&self, weights: &Weights, motions: &mut [Vec3]) {
-        self.add_linear(weights, motions);
+        let mut weights = *weights;
+        // Lids that shut meet where they always do, squinting or not.
+        for [squint, blink] in self.lid_shapes {
+            weights[squint] *= 1.0 - weights[blink].clamp(0.0, 1.0);
+        }
+        // Rolling in and shrugging lift the same lip: what both lift beyond one of them counts half, or it would cover the upper one.
+        let lift: f32 = self.lip_lifts.iter().map(|&shape| weights[shape]).sum();
+        if lift > 1.0 {
+            self.lip_lifts.iter().for_each(|&shape| weights[shape] *= 0.5 + 0.5 / lift);
+        }
+        self.add_linear(&weights, motions);
         if let Some(correctives) = &self.correctives {
-            correctives.add(weights, motions);
+            correctives.add(&weights, motions);
         }
         for (motion, limit) in motions.iter_mut().zip(&self.limits) {
             if let Limit::Angles(pitch, yaw) = limit {
@@ -117,8 +141,9 @@ fn author_turns(drive: &Drive, responses: &mut [Response], bone: usize) {
             let side = name_of(eye);
             set(&format!("eyeBlink{side}"), pitch(shut_angle));
             set(&format!("eyeWide{side}"), pitch(wide_angle));
+            set(&format!("eyeSquint{side}"), pitch(shut_angle * if lid == LidKind::Upper { SQUINT_SINKS } else { SQUINT_RISES }));
             // A lid's own travel is about the eye's up and down range.
-            let follow = shut_angle.abs().max(0.2) * gaze_share(lid) as f32;
+            let follow = FOLLOWS_GAZE * shut_angle.abs().max(0.2) * gaze_share(lid) as f32;
             set(&format!("eyeLookDown{side}"), pitch(follow));
             set(&format!("eyeLookUp{side}"), pitch(if lid == LidKind::Upper { -0.5 * follow } else { -follow }));
         }
@@ -155,7 +180,10 @@ fn limit_of(drive: &Drive) -> Limit {
     match *drive {
         Drive::Skin { .. } | Drive::Still => Limit::Free,
         Drive::Jaw { max_angle, .. } => Limit::Angles([-0.1, max_angle], 0.0873),
-        Drive::Lid { shut_angle, wide_angle, .. } => Limit::Angles([shut_angle.min(wide_angle), shut_angle.max(wide_angle)], 0.0),
+        Drive::Lid { lid, shut_angle, wide_angle, .. } => {
+            let furthest = shut_angle * if lid == LidKind::Upper { 1.0 } else { SQUINT_RISES };
+            Limit::Angles([furthest.min(wide_angle), furthest.max(wide_angle)], 0.0)
+        }
         Drive::Eye { range, .. } => Limit::Angles([-range[1], range[1]], range[0]),
     }
 }

@@ -37,11 +37,11 @@ struct Frame {
     skin: vec4<f32>,
     // x: largest change of haemoglobin the codes of the map of blood reach, optical density; 0 where the colour stays.
     blood: vec4<f32>,
-    // x: metres a pixel covers at a metre.
+    // x: metres a pixel covers at a metre. y: how much brighter than its light the box is that wet mirrors show.
     picture: vec4<f32>,
-    // Influence view: 1 for each pose shown.
+    // Views of influences and masks: 1 for each pose or zone shown.
     shown_poses: array<vec4<f32>, 2>,
-    // x: see the constants.
+    // x: see the constants. y: the light that wet mirrors show.
     shown: vec4<u32>,
 }
 

@@ -39,7 +39,8 @@ fn shade(in: Varyings, is_front: bool, albedo: vec3<f32>) -> Shaded {
         // A fibre has no side that is wholly dark.
         light_in += arriving * max((dot(normal, frame.lights[i].direction.xyz) + 0.5) / 2.25, 0.0);
     }
-    let sheen = frame.lights[0].radiance.rgb * visible * highlight(normal, view, frame.lights[0].direction.xyz, 0.30, 0.04) * 0.3;
+    let key = frame.lights[0].direction.xyz;
+    let sheen = frame.lights[0].radiance.rgb * visible * highlight(normal, view, key, 0.30, 0.04) * masking(view, key, 0.30) * 0.3;
     return shaded(in.world, min(albedo * light_in, vec3<f32>(BRIGHTEST)), sheen, 0.0);
 }
 

@@ -86,10 +86,11 @@ fn room_reflection(direction: vec3<f32>, roughness: f32) -> vec3<f32> {
     return textureSampleLevel(environment, smooth_sampler, uv, roughness * ROUGHEST_LEVEL).rgb;
 }
 
-// What a wet, sharp mirror shows: the room, and the key as the soft box it is.
+// What a wet, sharp mirror shows: the room, and one light of the set-up as the soft box it is.
 fn studio_reflection(direction: vec3<f32>) -> vec3<f32> {
-    let key_box = 1.0 - smoothstep(0.016, 0.026, 1.0 - dot(direction, frame.lights[0].direction.xyz));
-    return room_reflection(direction, 0.0) + frame.lights[0].radiance.rgb * key_box * 14.0;
+    let light = frame.lights[frame.shown.y];
+    let box = 1.0 - smoothstep(0.016, 0.026, 1.0 - dot(direction, light.direction.xyz));
+    return room_reflection(direction, 0.0) + light.radiance.rgb * (box * frame.picture.y);
 }
 
 fn fresnel(f0: f32, v_dot_h: f32) -> f32 {
@@ -111,6 +112,14 @@ fn highlight(normal: vec3<f32>, view: vec3<f32>, light: vec3<f32>, slope: f32, f
     let m2 = slope * slope;
     let beckmann = exp((x2 - 1.0) / (x2 * m2)) / (m2 * x2 * x2);
     return n_dot_l * beckmann * fresnel(f0, clamp(dot(view, halfway), 0.0, 1.0)) / h2;
+}
+
+// What microfacets hide from each other of a highlight: Kelemen's approximation forgets it and grows without limit towards
+// light from behind, so rough hair would shine like metal there. Lazarov's 2011 remedy, with the slope for his k squared.
+fn masking(view: vec3<f32>, light: vec3<f32>, slope: f32) -> f32 {
+    let sum = light + view;
+    let h2 = max(dot(sum, sum), 1e-4);
+    return h2 / mix(h2, 4.0, clamp(slope, 0.0, 1.0));
 }
 
 // Fresnel of light from all round, with roughness holding it back at grazing angles (Karis 2014, mobile fit).

@@ -20,7 +20,7 @@ fn shade(in: Varyings, normal: vec3<f32>) -> Shaded {
         let light = frame.lights[i].direction.xyz;
         let arriving = frame.lights[i].radiance.rgb * occlusion * select(1.0, visible, i == 0u);
         light_in += arriving * max((dot(normal, light) + 0.1) / 1.21, 0.0);
-        specular += arriving * highlight(normal, view, light, roughness * roughness, F0);
+        specular += arriving * highlight(normal, view, light, roughness * roughness, F0) * masking(view, light, roughness * roughness);
     }
     let reflected = room_reflection(reflect(-view, normal), roughness);
     specular += reflected * ambient_fresnel(F0, roughness, clamp(dot(normal, view), 0.0, 1.0)) * occlusion * visible;

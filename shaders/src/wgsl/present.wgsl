@@ -10,8 +10,13 @@ struct Present {
     is_split: u32,
     // 1: edges are smoothed.
     is_smoothed: u32,
-    padding: u32,
+    // 1: alpha is how much of the pixel is covered, else 1.
+    is_transparent: u32,
 }
+
+// Metres behind the camera's target: what is drawn is nearer than the first, what is behind everything is at the second.
+const BEHIND_HEAD: f32 = 1.0;
+const BEHIND_ALL: f32 = 8.0;
 
 // Contrast below which nothing is done: a part of the brightest luma around, and an absolute one. Tuned by eye.
 const LEAST_CONTRAST: f32 = 0.125;
@@ -25,6 +30,8 @@ const STEPS: array<f32, 8> = array<f32, 8>(1.0, 1.0, 1.0, 1.5, 2.0, 2.0, 2.0, 4.
 // Encoded colour, luma in alpha.
 @group(0) @binding(1) var picture: texture_2d<f32>;
 @group(0) @binding(2) var linear_sampler: sampler;
+// Alpha: metres behind the camera's target, the mean of a pixel's samples.
+@group(0) @binding(3) var diffuse: texture_2d<f32>;
 
 fn luma_at(uv: vec2<f32>) -> f32 {
     return textureSampleLevel(picture, linear_sampler, uv, 0.0).a;
@@ -95,5 +102,10 @@ fn fs_present(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {
     if present.is_split == 1u && i32(at.x) == i32(textureDimensions(picture).x / 2u) {
         encoded = vec3<f32>(0.95);
     }
-    return vec4<f32>(select(encoded, linear_from_srgb(encoded), present.target_encodes_srgb == 1u), 1.0);
+    var covered = 1.0;
+    if present.is_transparent == 1u {
+        let depth = textureSampleLevel(diffuse, linear_sampler, uv, 0.0).a;
+        covered = clamp((BEHIND_ALL - depth) / (BEHIND_ALL - BEHIND_HEAD), 0.0, 1.0);
+    }
+    return vec4<f32>(select(encoded, linear_from_srgb(encoded), present.target_encodes_srgb == 1u), covered);
 }

@@ -43,8 +43,10 @@ fn shade(in: Varyings, normal: vec3<f32>) -> Shaded {
         light_in += arriving * max(dot(normal, light), 0.0);
         let oily = highlight(normal, view, light, slope * OILY_ROUGHNESS * OILY_ROUGHNESS, F0);
         let dry = highlight(normal, view, light, slope, F0);
+        // The oil lies over the same rough skin: both lobes are hidden alike.
+        let seen = masking(view, light, slope);
         // Rims outline by their diffuse light; their highlights would look like sweat.
-        specular += arriving * mix(dry, oily, OILY_SHARE) * select(1.0, 0.2, i > 1u);
+        specular += arriving * (mix(dry, oily, OILY_SHARE) * seen) * select(1.0, 0.2, i > 1u);
     }
     let key = frame.lights[0];
     let behind = clamp(0.3 - dot(smooth_normal, key.direction.xyz), 0.0, 1.0);
@@ -66,7 +68,7 @@ fn shade(in: Varyings, normal: vec3<f32>) -> Shaded {
         let hue = select(vec3<f32>(0.0, 0.75, 0.85), vec3<f32>(0.95, 0.10, 0.05), blood > 0.0);
         return display(mix(grey, hue * (0.4 + grey), clamp(abs(blood) / BLOOD_SHOWN, 0.0, 1.0)));
     }
-    return shaded(in.world, min(diffuse, vec3<f32>(BRIGHTEST)), min(specular * frame.skin.y, vec3<f32>(BRIGHTEST)), in_mouth);
+    return shaded(in.world, min(diffuse, vec3<f32>(BRIGHTEST)), min(specular * (frame.skin.y * finish.intensity), vec3<f32>(BRIGHTEST)), in_mouth);
 }
 
 @fragment

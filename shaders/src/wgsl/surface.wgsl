@@ -12,6 +12,8 @@ struct Material {
     roughness: f32,
     // How much of the occlusion map counts, 0 to 1.
     occlusion_strength: f32,
+    // 1: blue of the surface map is the strength of highlights; 0: it is 1 everywhere.
+    has_intensity: f32,
 }
 
 // Poses that can wrinkle what is drawn, one bit each; the maps of the others are not read.
@@ -41,7 +43,7 @@ struct ZoneWeights {
 @group(2) @binding(0) var<uniform> material: Material;
 @group(2) @binding(1) var albedo_map: texture_2d<f32>;
 @group(2) @binding(2) var normal_map: texture_2d<f32>;
-// Red: ambient occlusion. Green: roughness.
+// Red: ambient occlusion. Green: roughness. Blue: strength of highlights, see the material.
 @group(2) @binding(3) var surface_map: texture_2d<f32>;
 @group(2) @binding(4) var map_sampler: sampler;
 
@@ -159,9 +161,17 @@ fn albedo_of(uv: vec2<f32>) -> vec4<f32> {
 struct Finish {
     occlusion: f32,
     roughness: f32,
+    // Multiplies highlights: how oily skin is, apart from how rough.
+    intensity: f32,
+}
+
+// Code 128 of a unorm texture is exactly 1, the most is nearly 2.
+fn intensity_of(code: f32, has_intensity: f32) -> f32 {
+    return mix(1.0, code * (255.0 / 128.0), has_intensity);
 }
 
 fn finish_of(uv: vec2<f32>) -> Finish {
     let texel = textureSample(surface_map, map_sampler, uv);
-    return Finish(mix(1.0, texel.x, material.occlusion_strength), material.roughness * texel.y);
+    let occlusion = mix(1.0, texel.x, material.occlusion_strength);
+    return Finish(occlusion, material.roughness * texel.y, intensity_of(texel.z, material.has_intensity));
 }

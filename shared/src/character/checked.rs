@@ -253,7 +253,7 @@ impl Character {
         let poses = check_poses(&face.poses, &bones, &index_of)?;
         let correctives = check_correctives(&face.correctives, &index_of)?;
         let zones = face.zones.as_ref().map(|given| zones::check(given, &poses, &index_of)).transpose()?;
-        let colour = face.colour.as_ref().map(|given| colour::check(given, &poses)).transpose()?;
+        let colour = face.colour.as_ref().map(|given| colour::check(given, &poses, zones.as_ref())).transpose()?;
         let falloff = face.evaluation.falloff;
         if !(falloff > 0.0 && falloff <= 1.0) {
             return Err(CharacterError::field(

@@ -2,6 +2,7 @@
 
 use super::checked::{CharacterError, Pose, Result};
 use super::schema;
+use super::zones::Zones;
 
 /// Blood under the skin and what poses do to it, checked. Amounts of haemoglobin are optical densities along its direction.
 #[derive(Debug, Clone, PartialEq)]
@@ -10,17 +11,26 @@ pub struct Colour {
     pub base: usize,
     /// Most haemoglobin a place can hold.
     pub most: f32,
-    /// What poses do, each pose once at most.
+    /// What poses and zones do, each once at most.
     pub changes: Vec<ColourChange>,
     /// Multiplies what the changes do to the colour, 0 to 4.
     pub strength: f32,
 }
 
-/// What a pose does to the blood, checked.
+/// What a change of the blood follows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ColourDriver {
+    /// Index of the reference pose: its mean influence on each half of the face.
+    Pose(usize),
+    /// Index of the wrinkle zone: how strongly its wrinkles show.
+    Zone(usize),
+}
+
+/// What a pose or a zone does to the blood, checked.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ColourChange {
-    /// Index of the reference pose.
-    pub pose: usize,
+    /// What it follows.
+    pub driver: ColourDriver,
     /// Index into glTF `textures`: spread in red, shift in green, as `(code - 128) / 127` of the two below.
     pub texture: usize,
     /// Largest change of the unevenness: its ratio less 1.
@@ -35,7 +45,7 @@ const MOST_BLOOD: f32 = 5.0;
 const MOST_STRENGTH: f32 = 4.0;
 
 /// Checks everything but the images.
-pub(super) fn check(given: &schema::Colour, poses: &[Pose]) -> Result<Colour> {
+pub(super) fn check(given: &schema::Colour, poses: &[Pose], zones: Option<&Zones>) -> Result<Colour> {
     let refuse = |field: &str, problem: String| Err(CharacterError::field(format!("RHYTID_face.colour.{field}"), problem));
     // Written so that NaN is refused, too.
     let is_within = |value: f32, most: f32| value > 0.0 && value <= most;
@@ -47,18 +57,26 @@ pub(super) fn check(given: &schema::Colour, poses: &[Pose]) -> Result<Colour> {
     }
     let mut changes: Vec<ColourChange> = Vec::with_capacity(poses.len());
     for (c, change) in given.changes.iter().enumerate() {
-        let Some(pose) = poses.iter().position(|pose| pose.name == change.pose) else {
-            return refuse(&format!("changes[{c}].pose"), format!("names {:?}, which is no pose of this character", change.pose));
+        let (field, name, found) = match (&change.pose, &change.zone) {
+            (Some(name), None) => ("pose", name, poses.iter().position(|pose| pose.name == *name).map(ColourDriver::Pose)),
+            (None, Some(name)) => {
+                let list = zones.map_or(&[][..], |zones| &zones.list);
+                ("zone", name, list.iter().position(|zone| zone.name == *name).map(ColourDriver::Zone))
+            }
+            _ => return refuse(&format!("changes[{c}]"), "names a pose and a zone or neither, expected one of both".into()),
         };
-        if changes.iter().any(|other| other.pose == pose) {
-            return refuse(&format!("changes[{c}].pose"), format!("names {:?}, which has its change already", change.pose));
+        let Some(driver) = found else {
+            return refuse(&format!("changes[{c}].{field}"), format!("names {name:?}, which is no {field} of this character"));
+        };
+        if changes.iter().any(|other| other.driver == driver) {
+            return refuse(&format!("changes[{c}].{field}"), format!("names {name:?}, which has its change already"));
         }
         for (field, value, most) in [("spread", change.spread, 4.0), ("shift", change.shift, given.most)] {
             if !is_within(value, most) {
                 return refuse(&format!("changes[{c}].{field}"), format!("is {value}, expected more than 0 and at most {most}"));
             }
         }
-        changes.push(ColourChange { pose, texture: change.texture, spread: change.spread, shift: change.shift });
+        changes.push(ColourChange { driver, texture: change.texture, spread: change.spread, shift: change.shift });
     }
     Ok(Colour { base: given.base, most: given.most, changes, strength: given.strength })
 }

@@ -2,16 +2,19 @@
 //! one frame of 478 points costs more time than everything the solve does with it.
 
 use super::MessageError;
-use super::reader::Names;
+use super::profile::{Profile, ProfileChoice};
+use super::reader::{Names, TYPES};
+use super::settings::Settings;
+use super::slot::{ChannelGroup, ChannelGroups};
 use crate::limits::{MAX_EXPRESSIONS, MAX_FEATURE_POINTS, MAX_HEAD_TRAVEL};
-use crate::names::{ArkitShape, NUM_ARKIT_SHAPES};
+use crate::names::{ArkitShape, NUM_ARKIT_SHAPES, RoomName};
 use glam::{Quat, Vec3};
 use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use std::collections::BTreeMap;
 use std::fmt;
 
 /// Farthest a landmark may lie from the picture's origin, pixels: more than any camera has, less than what overflows.
-const MAX_PIXELS: f64 = 1e5;
+pub(super) const MAX_PIXELS: f64 = 1e5;
 /// Largest weight that still reads as a slip of a tracker and not as another unit (percent, degrees).
 const MAX_WEIGHT: f64 = 10.0;
 /// Largest weight passed on; trackers overshoot 1 a little.
@@ -31,6 +34,10 @@ pub(super) enum Kind {
     Hello,
     Frame,
     Calibrate,
+    Settings,
+    Recentre,
+    Fit,
+    Profile,
 }
 
 /// The layout of a hello as it was written.
@@ -51,7 +58,18 @@ pub(super) struct Fields {
     pub image: Option<[f64; 2]>,
     pub focal: Option<f64>,
     pub takeover: bool,
+    pub slot: Option<String>,
+    pub priority: Option<f64>,
+    pub groups: Option<ChannelGroups>,
+    /// Of a hello, and those of a message of their own.
+    pub settings: Option<Settings>,
+    pub change: Settings,
     pub keep_neutral: bool,
+    pub profile: Option<ProfileChoice>,
+    /// Of the guided fit.
+    pub step: Option<String>,
+    pub seconds: Option<f64>,
+    pub name: Option<String>,
     pub t: Option<f64>,
     pub face: Option<bool>,
     pub has_landmarks: bool,
@@ -86,7 +104,16 @@ impl Fields {
             image: None,
             focal: None,
             takeover: false,
+            slot: None,
+            priority: None,
+            groups: None,
+            settings: None,
+            change: Settings::default(),
             keep_neutral: false,
+            profile: None,
+            step: None,
+            seconds: None,
+            name: None,
             t: None,
             face: None,
             has_landmarks: false,
@@ -113,6 +140,9 @@ impl Fields {
         (self.version, self.fps, self.focal, self.t) = (None, None, None, None);
         (self.source, self.layout, self.image) = (None, None, None);
         (self.takeover, self.keep_neutral) = (false, false);
+        (self.slot, self.priority, self.groups) = (None, None, None);
+        (self.settings, self.change) = (None, Settings::default());
+        (self.profile, self.step, self.seconds, self.name) = (None, None, None, None);
         self.face = None;
         (self.has_landmarks, self.has_confidence, self.has_weights) = (false, false, false);
         (self.has_bones, self.has_expressions) = (false, false);
@@ -160,7 +190,7 @@ enum Key {
 }
 
 /// Every field of every message.
-const KEYS: [&str; 17] = [
+const KEYS: [&str; 30] = [
     "type",
     "t",
     "landmarks",
@@ -178,6 +208,19 @@ const KEYS: [&str; 17] = [
     "focal",
     "takeover",
     "keep_neutral",
+    "slot",
+    "priority",
+    "groups",
+    "settings",
+    "mirror",
+    "gains",
+    "smoothing",
+    "swap_jaw",
+    "swap_mouth",
+    "profile",
+    "step",
+    "seconds",
+    "name",
 ];
 
 impl<'de> serde::Deserialize<'de> for Key {
@@ -213,14 +256,16 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
             fields.reading = key;
             match key {
                 "type" => {
-                    let name = map.next_value_seed(Text("\"hello\", \"frame\" or \"calibrate\""))?;
+                    let name = map.next_value_seed(Text(TYPES))?;
                     match name.as_str() {
                         "hello" => fields.kind = Some(Kind::Hello),
                         "frame" => fields.kind = Some(Kind::Frame),
                         "calibrate" => fields.kind = Some(Kind::Calibrate),
-                        _ => fields.refuse("unknown_type", || {
-                            format!("field type is {:?}, expected \"hello\", \"frame\" or \"calibrate\"", cut(&name))
-                        }),
+                        "settings" => fields.kind = Some(Kind::Settings),
+                        "recentre" => fields.kind = Some(Kind::Recentre),
+                        "fit" => fields.kind = Some(Kind::Fit),
+                        "profile" => fields.kind = Some(Kind::Profile),
+                        _ => fields.refuse("unknown_type", || format!("field type is {:?}, expected {TYPES}", cut(&name))),
                     }
                 }
                 "t" => fields.t = Some(map.next_value_seed(Number("seconds on the sender's clock"))?),
@@ -244,6 +289,19 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
                 }
                 "focal" => fields.focal = Some(map.next_value_seed(Number("pixels"))?),
                 "takeover" => fields.takeover = map.next_value_seed(Flag)?,
+                "slot" => fields.slot = Some(map.next_value_seed(Text("the name of a source slot"))?),
+                "priority" => fields.priority = Some(map.next_value_seed(Number("a priority, 0 to 100"))?),
+                "groups" => map.next_value_seed(Groups(fields))?,
+                "settings" => fields.settings = Some(map.next_value()?),
+                "mirror" => fields.change.mirror = Some(map.next_value_seed(Flag)?),
+                "gains" => fields.change.gains = map.next_value()?,
+                "smoothing" => fields.change.smoothing = map.next_value()?,
+                "swap_jaw" => fields.change.swap_jaw = Some(map.next_value_seed(Flag)?),
+                "swap_mouth" => fields.change.swap_mouth = Some(map.next_value_seed(Flag)?),
+                "profile" => map.next_value_seed(ProfileSeed(fields))?,
+                "step" => fields.step = Some(map.next_value_seed(Text("a step of the fit"))?),
+                "seconds" => fields.seconds = Some(map.next_value_seed(Number("seconds to measure"))?),
+                "name" => fields.name = Some(map.next_value_seed(Text("a profile's name"))?),
                 _ => fields.keep_neutral = map.next_value_seed(Flag)?,
             }
             fields.reading = "";
@@ -253,7 +311,7 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
 }
 
 /// A piece of what the sender wrote, short enough for an error.
-fn cut(text: &str) -> String {
+pub(super) fn cut(text: &str) -> String {
     text.chars().take(40).collect()
 }
 
@@ -375,6 +433,73 @@ impl<'de> Visitor<'de> for LayoutSeed {
             }
         }
         Ok(LayoutField::List(names))
+    }
+}
+
+/// A profile, or the name of one.
+struct ProfileSeed<'a>(&'a mut Fields);
+
+impl<'de> DeserializeSeed<'de> for ProfileSeed<'_> {
+    type Value = ();
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for ProfileSeed<'_> {
+    type Value = ();
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a profile, or the name of one that the server keeps")
+    }
+    fn visit_str<E: Error>(self, name: &str) -> Result<(), E> {
+        match RoomName::new(name) {
+            Ok(name) => self.0.profile = Some(ProfileChoice::Named(name)),
+            Err(_) => self.0.refuse("out_of_range", || {
+                format!("field profile is {:?}, expected a profile, or a name of 1 to 64 characters of A-Z a-z 0-9 _ -", cut(name))
+            }),
+        }
+        Ok(())
+    }
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<(), A::Error> {
+        let profile = <Profile as serde::Deserialize>::deserialize(serde::de::value::MapAccessDeserializer::new(map))?;
+        match profile.check() {
+            Ok(()) => self.0.profile = Some(ProfileChoice::Given(Box::new(profile))),
+            Err(error) => self.0.refuse(error.code, || format!("field profile: {}", error.message)),
+        }
+        Ok(())
+    }
+}
+
+struct Groups<'a>(&'a mut Fields);
+
+impl<'de> DeserializeSeed<'de> for Groups<'_> {
+    type Value = ();
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_seq(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Groups<'_> {
+    type Value = ();
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("an array of channel groups")
+    }
+    fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<(), A::Error> {
+        let fields = self.0;
+        let mut groups = ChannelGroups::NONE;
+        while let Some(name) = seq.next_element_seed(Text("a channel group"))? {
+            match ChannelGroup::from_name(&name) {
+                Some(group) => groups = groups.with(group),
+                None => fields.refuse("out_of_range", || {
+                    format!("field groups has {:?}, expected brows, lids, gaze, mouth and head only", cut(&name))
+                }),
+            }
+        }
+        if groups == ChannelGroups::NONE {
+            fields.refuse("out_of_range", || "field groups is empty, expected at least one of brows, lids, gaze, mouth, head".to_owned());
+        }
+        fields.groups = Some(groups);
+        Ok(())
     }
 }
 

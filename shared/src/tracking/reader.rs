@@ -1,12 +1,15 @@
 //! One publish session's messages, checked in their order.
 
-use super::fields::{Fields, Kind, LayoutField};
-use super::{MessageError, PublishHello, PublishMessage, TrackingData, TrackingFrame};
+use super::binary;
+use super::fields::{Fields, Kind, LayoutField, cut};
+use super::{
+    Command, FIT_SECONDS, FitRequest, FitStep, MessageError, PublishHello, PublishMessage, Settings, Slot, TrackingData, TrackingFrame,
+};
 use crate::character::Character;
 use crate::face::HeadPose;
 use crate::layout::Layout;
 use crate::limits::{FOCAL_RANGE, MAX_FEATURE_POINTS, MAX_SECONDS};
-use crate::names::NUM_ARKIT_SHAPES;
+use crate::names::{NUM_ARKIT_SHAPES, RoomName};
 use crate::view::PROTOCOL_VERSION;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,6 +17,15 @@ use std::collections::{BTreeMap, BTreeSet};
 const MAX_IMAGE: f64 = 1e5;
 /// Most frames a second a hello may claim: faster than any face camera.
 const MAX_FPS: f64 = 1000.0;
+
+/// Types of a publisher's messages, for errors.
+pub(super) const TYPES: &str = "\"hello\", \"frame\", \"calibrate\", \"recentre\", \"settings\", \"fit\" or \"profile\"";
+/// Types of commands, for errors.
+const COMMANDS: &str = "\"calibrate\", \"recentre\", \"settings\", \"fit\" or \"profile\"";
+/// Steps of the fit, for errors.
+const STEPS: &str = "neutral, brows_up, frown, smile, pucker, jaw_open, blink, mouth_left, finish or cancel";
+/// How long a step measures where nothing is said.
+const DEFAULT_FIT_SECONDS: f64 = 1.5;
 
 /// Reads the text messages of one publish session, or the lines of a feed file, without building a tree of JSON.
 #[derive(Debug, Clone)]
@@ -59,7 +71,7 @@ impl PublishReader {
         if let Some(problem) = self.fields.problem.take() {
             return Err(problem);
         }
-        let kind = self.fields.kind.ok_or_else(|| missing("type", "\"hello\", \"frame\" or \"calibrate\""))?;
+        let kind = self.fields.kind.ok_or_else(|| missing("type", TYPES))?;
         match (kind, &self.hello) {
             (Kind::Hello, Some(_)) => {
                 Err(MessageError::new("repeated_hello", "field type is \"hello\" a second time, expected one hello a session"))
@@ -69,12 +81,39 @@ impl PublishReader {
                 self.hello = Some(hello.clone());
                 Ok(PublishMessage::Hello(hello))
             }
-            (Kind::Frame | Kind::Calibrate, None) => {
-                Err(MessageError::new("no_hello", "the first message must be {\"type\":\"hello\",\"version\":1,…}"))
-            }
-            (Kind::Calibrate, Some(_)) => Ok(PublishMessage::Calibrate),
+            (_, None) => Err(MessageError::new("no_hello", "the first message must be {\"type\":\"hello\",\"version\":1,…}")),
             (Kind::Frame, Some(_)) => self.check_frame(frame).map(|()| PublishMessage::Frame),
+            (kind, Some(_)) => check_command(kind, &mut self.fields).map(PublishMessage::Command),
         }
+    }
+
+    /// Reads one message of a control socket, which brings no frames and needs no hello.
+    pub fn read_command(text: &str) -> Result<Command, MessageError> {
+        let mut fields = Fields::new();
+        fields.read(text, None)?;
+        if let Some(problem) = fields.problem.take() {
+            return Err(problem);
+        }
+        let kind = fields.kind.ok_or_else(|| missing("type", COMMANDS))?;
+        check_command(kind, &mut fields)
+    }
+
+    /// Reads one binary message, which is a landmark frame (see `encode_landmarks`). After an error `frame` is as it was.
+    pub fn read_binary(&mut self, bytes: &[u8], frame: &mut TrackingFrame) -> Result<PublishMessage, MessageError> {
+        let Some(hello) = &self.hello else {
+            return Err(MessageError::new("no_hello", "the first message must be the text {\"type\":\"hello\",\"version\":1,…}"));
+        };
+        let layout = hello
+            .layout
+            .as_ref()
+            .ok_or_else(|| MessageError::new("no_layout", "frame has landmarks, expected field layout in the hello to say which"))?;
+        let t = binary::decode(bytes, layout.num_points(), &mut self.fields.landmarks, &mut self.fields.confidence)?;
+        self.check_time(t)?;
+        take_landmarks(&mut self.fields, &mut frame.data);
+        frame.expressions = None;
+        frame.t = t;
+        self.t_before = self.last_t.replace(t);
+        Ok(PublishMessage::Frame)
     }
 
     /// The frame last read was refused by what comes after the reader: the session's clock stands as it did before that frame,
@@ -114,21 +153,30 @@ impl PublishReader {
             image,
             focal: fields.focal.map(|focal| check_focal(focal, image)).transpose()?,
             takeover: fields.takeover,
+            settings: check_settings(fields.settings)?,
+            slot: Slot::check(fields.slot.take(), fields.priority, fields.groups)?,
             keep_neutral: fields.keep_neutral,
+            profile: fields.profile.take(),
         })
     }
 
-    fn check_frame(&mut self, frame: &mut TrackingFrame) -> Result<(), MessageError> {
-        let fields = &mut self.fields;
-        let t = fields.t.ok_or_else(|| missing("t", "seconds on the sender's clock"))?;
+    fn check_time(&self, t: f64) -> Result<(), MessageError> {
+        // A NaN is in no range.
         if !(0.0..=MAX_SECONDS).contains(&t) {
             return Err(MessageError::new("out_of_range", format!("field t is {t}, expected seconds from 0 to {MAX_SECONDS}")));
         }
-        if let Some(last) = self.last_t
-            && t <= last
-        {
-            return Err(MessageError::new("time_order", format!("field t is {t}, expected more than the {last} of the frame before")));
+        match self.last_t {
+            Some(last) if t <= last => {
+                Err(MessageError::new("time_order", format!("field t is {t}, expected more than the {last} of the frame before")))
+            }
+            _ => Ok(()),
         }
+    }
+
+    fn check_frame(&mut self, frame: &mut TrackingFrame) -> Result<(), MessageError> {
+        let t = self.fields.t.ok_or_else(|| missing("t", "seconds on the sender's clock"))?;
+        self.check_time(t)?;
+        let fields = &mut self.fields;
         let head = (fields.head_rotation.is_some() || fields.head_position.is_some())
             .then(|| HeadPose { rotation: fields.head_rotation.unwrap_or_default(), position: fields.head_position.unwrap_or_default() });
         match (fields.has_landmarks, fields.has_weights, fields.has_bones) {
@@ -179,6 +227,56 @@ impl PublishReader {
         self.t_before = self.last_t.replace(t);
         Ok(())
     }
+}
+
+/// What a command's fields say.
+fn check_command(kind: Kind, fields: &mut Fields) -> Result<Command, MessageError> {
+    match kind {
+        Kind::Calibrate => Ok(Command::Calibrate),
+        Kind::Recentre => Ok(Command::Recentre),
+        Kind::Settings => {
+            fields.change.check()?;
+            Ok(Command::Settings(fields.change))
+        }
+        Kind::Profile => {
+            let choice = fields.profile.take().ok_or_else(|| missing("profile", "a profile, or the name of one that the server keeps"))?;
+            Ok(Command::Profile(choice))
+        }
+        Kind::Fit => check_fit(fields).map(Command::Fit),
+        Kind::Hello | Kind::Frame => {
+            Err(MessageError::new("unknown_type", format!("field type is that of a publisher, expected {COMMANDS}")))
+        }
+    }
+}
+
+fn check_fit(fields: &mut Fields) -> Result<FitRequest, MessageError> {
+    let step = fields.step.take().ok_or_else(|| missing("step", STEPS))?;
+    let out_of_range = |message: String| Err(MessageError::new("out_of_range", message));
+    match step.as_str() {
+        "cancel" => return Ok(FitRequest::Cancel),
+        "finish" => {
+            let Some(name) = fields.name.take() else { return Ok(FitRequest::Finish { name: None }) };
+            return match RoomName::new(&name) {
+                Ok(name) => Ok(FitRequest::Finish { name: Some(name) }),
+                Err(_) => out_of_range(format!("field name is {:?}, expected 1 to 64 characters of A-Z a-z 0-9 _ -", cut(&name))),
+            };
+        }
+        _ => {}
+    }
+    let Some(step) = FitStep::from_name(&step) else { return out_of_range(format!("field step is {:?}, expected {STEPS}", cut(&step))) };
+    let [least, most] = FIT_SECONDS;
+    let seconds = fields.seconds.unwrap_or(DEFAULT_FIT_SECONDS);
+    // A NaN is in no range.
+    if !(least..=most).contains(&seconds) {
+        return out_of_range(format!("field seconds is {seconds}, expected {least} to {most}"));
+    }
+    Ok(FitRequest::Measure { step, seconds })
+}
+
+fn check_settings(settings: Option<Settings>) -> Result<Settings, MessageError> {
+    let settings = settings.unwrap_or_default();
+    settings.check().map_err(|error| MessageError::new(error.code, error.message.replacen("field ", "field settings.", 1)))?;
+    Ok(settings)
 }
 
 fn missing(field: &str, expected: &str) -> MessageError {
@@ -260,6 +358,12 @@ fn check_landmarks(fields: &mut Fields, layout: Option<&Layout>, data: &mut Trac
     if !fields.has_confidence {
         fields.confidence.clear();
     }
+    take_landmarks(fields, data);
+    Ok(())
+}
+
+/// Hands the points read to a frame, in exchange for its old buffers.
+fn take_landmarks(fields: &mut Fields, data: &mut TrackingData) {
     if !matches!(data, TrackingData::Landmarks { .. }) {
         *data = TrackingData::Landmarks { points: Vec::new(), confidence: Vec::new() };
     }
@@ -267,7 +371,6 @@ fn check_landmarks(fields: &mut Fields, layout: Option<&Layout>, data: &mut Trac
         std::mem::swap(points, &mut fields.landmarks);
         std::mem::swap(confidence, &mut fields.confidence);
     }
-    Ok(())
 }
 
 fn name_of(layout: &Layout) -> &'static str {
@@ -325,7 +428,7 @@ mod tests {
         let got = read(r#"{"type":"frame","t":2,"bones":{"brow_r":[0,0.05,0.1]}}"#);
         assert_eq!(got.data, TrackingData::Bones { points: vec![(1, Vec3::new(0.0, 0.05, 0.1))], head: None });
         assert_eq!(read(r#"{"type":"frame","t":3,"face":false}"#).data, TrackingData::NoFace);
-        assert_eq!(reader.read(r#"{"type":"calibrate"}"#, &mut frame), Ok(PublishMessage::Calibrate));
+        assert_eq!(reader.read(r#"{"type":"calibrate"}"#, &mut frame), Ok(PublishMessage::Command(Command::Calibrate)));
     }
 
     #[test]
@@ -358,7 +461,7 @@ mod tests {
             (r#"{"type":"frame","landmarks":[[1,2],[3,4]]}"#, "missing_field", "field t is missing"),
             (r#"{"type":"frame","t":2}"#, "missing_field", "landmarks, weights, bones, expressions or \"face\":false"),
             (r#"{"t":2,"face":false}"#, "missing_field", "field type"),
-            (r#"{"type":"settings","t":2}"#, "unknown_type", "\"settings\""),
+            (r#"{"type":"setting","t":2}"#, "unknown_type", "\"setting\""),
             (r#"{"type":"frame","t":1,"face":false}"#, "time_order", "field t is 1, expected more than the 1"),
             (r#"{"type":"frame","t":0.5,"face":false}"#, "time_order", "expected more than the 1"),
             (r#"{"type":"frame","t":-1,"face":false}"#, "out_of_range", "field t is -1"),
@@ -392,6 +495,26 @@ mod tests {
             assert_eq!(frame, before, "{text}");
         }
         reader.read(r#"{"type":"frame","t":1.01,"face":false}"#, &mut frame).unwrap();
+    }
+
+    #[test]
+    fn a_binary_frame_is_one_like_any_other() {
+        let (mut reader, mut frame) = reader();
+        let mut bytes = Vec::new();
+        crate::tracking::encode_landmarks(1.0, &[[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]], &[], &mut bytes).unwrap();
+        assert_eq!(reader.read_binary(&bytes, &mut frame).unwrap_err().code, "no_hello");
+        reader.read(HELLO, &mut frame).unwrap();
+        assert_eq!(reader.read_binary(&bytes, &mut frame), Ok(PublishMessage::Frame));
+        let TrackingData::Landmarks { points, confidence } = &frame.data else { panic!("not landmarks") };
+        assert!(frame.t == 1.0 && points.len() == 2 && (points[1][1] - 4.0).abs() < 1e-4 && confidence.is_empty());
+        let before = frame.clone();
+        assert_eq!(reader.read_binary(&bytes, &mut frame).unwrap_err().code, "time_order", "the clock is that of the JSON frames");
+        bytes[4..12].copy_from_slice(&f64::NAN.to_le_bytes());
+        assert_eq!(reader.read_binary(&bytes, &mut frame).unwrap_err().code, "out_of_range");
+        assert_eq!(frame, before);
+        let mut weights_only = PublishReader::for_any_character();
+        weights_only.read(r#"{"type":"hello","version":1}"#, &mut frame).unwrap();
+        assert_eq!(weights_only.read_binary(&bytes, &mut frame).unwrap_err().code, "no_layout");
     }
 
     #[test]
@@ -500,6 +623,17 @@ mod tests {
                 "field takeover: invalid type: string \"yes\", expected true or false",
             ),
             (r#"{"type":"hello","version":1,"keep_neutral":1}"#, "wrong_type", "field keep_neutral"),
+            (r#"{"type":"hello","version":1,"slot":"a b"}"#, "out_of_range", "field slot is \"a b\", expected 1 to 64"),
+            (r#"{"type":"hello","version":1,"slot":5}"#, "wrong_type", "field slot"),
+            (
+                r#"{"type":"hello","version":1,"priority":101}"#,
+                "out_of_range",
+                "field priority is 101, expected a whole number from 0 to 100",
+            ),
+            (r#"{"type":"hello","version":1,"priority":1.5}"#, "out_of_range", "field priority is 1.5"),
+            (r#"{"type":"hello","version":1,"groups":["brows","ears"]}"#, "out_of_range", "field groups has \"ears\", expected brows"),
+            (r#"{"type":"hello","version":1,"groups":[]}"#, "out_of_range", "field groups is empty"),
+            (r#"{"type":"hello","version":1,"groups":"brows"}"#, "wrong_type", "field groups"),
         ] {
             let (mut reader, mut frame) = reader();
             let error = reader.read(text, &mut frame).expect_err(text);

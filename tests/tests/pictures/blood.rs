@@ -10,7 +10,9 @@ use image::RgbaImage;
 use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
 use rhytid_client::renderer::{SkinSettings, Term, uniforms};
 use rhytid_client::{DrawSettings, RenderFrame, ViewMode, twin};
+use rhytid_shared::character::ColourDriver;
 use rhytid_shared::{Character, TrackingData};
+use std::sync::Arc;
 
 pub fn add(add: &mut Add<'_>) {
     add("blood::albedo_with_more_blood".into(), Box::new(albedo));
@@ -19,6 +21,7 @@ pub fn add(add: &mut Add<'_>) {
     add("blood::frown_reddens_the_glabella".into(), Box::new(frown));
     add("blood::raised_brows_pale_the_forehead".into(), Box::new(raised_brows));
     add("blood::half_a_smile_reddens_one_cheek".into(), Box::new(half_a_smile));
+    add("blood::zones_drive_it_where_there_are_no_poses".into(), Box::new(zones_alone));
     add("blood::switched_off_is_a_face_without_it".into(), Box::new(switched_off));
 }
 
@@ -83,7 +86,7 @@ fn codes(stage: &Stage) -> anyhow::Result<()> {
 
 fn posed(character: &Character, pose: &str, side: StillSide) -> anyhow::Result<RenderFrame> {
     let points = posed_points(character, pose, 1.0, side)?;
-    Ok(RenderFrame::from(&solve_one(&std::sync::Arc::new(character.clone()), TrackingData::Bones { points, head: None })?))
+    Ok(RenderFrame::from(&solve_one(&Arc::new(character.clone()), TrackingData::Bones { points, head: None })?))
 }
 
 fn render(stage: &Stage, frame: &RenderFrame, view: ViewMode, blood: f32) -> anyhow::Result<RgbaImage> {
@@ -137,7 +140,7 @@ fn frown(stage: &Stage) -> anyhow::Result<()> {
 
 fn raised_brows(stage: &Stage) -> anyhow::Result<()> {
     let marks = &stage.asset.character.ibug68;
-    let reddens = reddening(stage, "stretch", StillSide::Both, &[marks[27] + Vec3::Y * 0.055])?[0];
+    let reddens = reddening(stage, "stretch", StillSide::Both, &[marks[27] + Vec3::Y * 0.045])?[0];
     ensure!(reddens < -2.5, "the forehead reddens by {reddens:.1} codes");
     Ok(())
 }
@@ -147,6 +150,35 @@ fn half_a_smile(stage: &Stage) -> anyhow::Result<()> {
     let places = [cheek(character, 46, 1.0), cheek(character, 41, -1.0)];
     let [left, right] = reddening(stage, "smile", StillSide::Left, &places)?[..] else { unreachable!("two places") };
     ensure!(left > 4.0 && right.abs() < 0.25 * left, "the left cheek reddens by {left:.1} codes, the right by {right:.1}");
+    Ok(())
+}
+
+/// The character without its poses, the frown's blood driven by the zone between the brows.
+fn zones_alone(stage: &Stage) -> anyhow::Result<()> {
+    let character = &stage.asset.character;
+    let frown = character.poses.iter().position(|pose| pose.name == "compress").context("a pose of frowning")?;
+    let zones = character.zones.as_ref().context("the built-in character has zones")?;
+    let glabella = zones.list.iter().position(|zone| zone.side.is_none()).context("a zone between the brows")?;
+    let without_poses = stage.variant(|asset| {
+        Arc::make_mut(&mut asset.character).poses.clear();
+        asset.wrinkles = None;
+        if let Some(blood) = &mut asset.blood {
+            blood.changes.retain(|change| change.driver == ColourDriver::Pose(frown));
+            blood.changes.iter_mut().for_each(|change| change.driver = ColourDriver::Zone(glabella));
+        }
+    })?;
+    let place = character.ibug68[27] + Vec3::Y * 0.006;
+    let reddens = |weight: f32| -> anyhow::Result<f64> {
+        let mut frame = RenderFrame::at_rest(&without_poses.asset.character);
+        frame.zones[glabella] = weight;
+        let [with, without] = [1.0, 0.0].map(|blood| render(&without_poses, &frame, ViewMode::Beauty, blood));
+        Ok(redness(&with?, character, place) - redness(&without?, character, place))
+    };
+    let [rest, half, whole] = [reddens(0.0)?, reddens(0.5)?, reddens(1.0)?];
+    ensure!(
+        rest.abs() < 0.2 && half > 1.0 && whole > half + 0.8,
+        "between the brows the skin reddens by {rest:.1}, {half:.1} and {whole:.1} codes"
+    );
     Ok(())
 }
 

@@ -1,16 +1,18 @@
 //! Golden pictures. Each comes with wrong pictures that must not pass for it: another blend, weaker wrinkles, another
-//! solve. How near a picture must come is a share of how far the wrong ones are, so the rules hold for any character.
+//! solve, another share of the term that is shown. How near a picture must come is a share of how far the wrong ones are, so the rules hold for any character.
 
 use crate::{Add, Stage};
 use anyhow::{Context, ensure};
 use glam::Vec3;
 use image::{Rgb, RgbImage, RgbaImage};
-use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
+use rhytid_client::render_cli::{StillSide, posed_points, solve_first, solve_one};
+use rhytid_client::renderer::{SkinSettings, Studio, WrinkleSystem};
 use rhytid_client::{BlendMode, Camera, DrawSettings, RenderFrame, ViewMode};
 use rhytid_server::feed::{Feed, FeedItem};
 use rhytid_server::pipeline::Pipeline;
 use rhytid_server::solve::{OneEuroConfig, SolveConfig};
-use rhytid_shared::{Character, FaceFrame, TrackingData, TrackingFrame};
+use rhytid_shared::limits::MAX_EXPRESSIONS;
+use rhytid_shared::{ArkitShape, Character, FaceFrame, NUM_ARKIT_SHAPES, TrackingData, TrackingFrame};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -34,11 +36,16 @@ const MOST_SHARE: f64 = 0.25;
 #[derive(Clone)]
 pub struct Shot {
     pub face: Face,
-    /// Multiplies all influences.
+    /// Multiplies all influences, zone weights and expression weights.
     pub strength: f32,
     pub view: &'static str,
     pub blend: BlendMode,
     pub lens: Lens,
+    pub system: WrinkleSystem,
+    pub studio: Studio,
+    /// Turn of the key light, degrees.
+    pub key_turn: f32,
+    pub skin: SkinSettings,
 }
 
 /// The face one golden shows.
@@ -48,6 +55,8 @@ pub enum Face {
     Pose(&'static str, f32, StillSide),
     /// The frame of the built-in session with this index, solved with all that came before it.
     Session(usize, Solve),
+    /// Expression weights, and an expression of the character's table that is shown in full.
+    Expression(&'static str, &'static [(&'static str, f32)]),
 }
 
 /// How a session is solved.
@@ -75,7 +84,31 @@ pub enum Lens {
     Furrows,
 }
 
-pub const REST: Shot = Shot { face: Face::Rest, strength: 1.0, view: "beauty", blend: BlendMode::PartialDerivatives, lens: Lens::Face };
+/// As `SkinSettings::default()`, which is no constant.
+const SKIN: SkinSettings = SkinSettings { scattering: 1.0, translucency: 1.0, gloss: 1.0, roughness: 1.0, blood: 1.0 };
+
+pub const REST: Shot = Shot {
+    face: Face::Rest,
+    strength: 1.0,
+    view: "beauty",
+    blend: BlendMode::PartialDerivatives,
+    lens: Lens::Face,
+    system: WrinkleSystem::Own,
+    studio: Studio::Portrait,
+    key_turn: 0.0,
+    skin: SKIN,
+};
+
+const SURPRISE: Face = Face::Expression(
+    "surprise",
+    &[("browInnerUp", 0.9), ("browOuterUpLeft", 0.9), ("browOuterUpRight", 0.9), ("eyeWideLeft", 0.7), ("eyeWideRight", 0.7)],
+);
+const ANGER: Face = Face::Expression(
+    "anger",
+    &[("browDownLeft", 1.0), ("browDownRight", 1.0), ("noseSneerLeft", 0.4), ("noseSneerRight", 0.4), ("mouthPressLeft", 0.6)],
+);
+const GRIN: Face =
+    Face::Expression("joy", &[("mouthSmileLeft", 0.8), ("mouthSmileRight", 0.8), ("cheekSquintLeft", 0.6), ("cheekSquintRight", 0.6)]);
 
 pub const fn posed(pose: &'static str) -> Shot {
     Shot { face: Face::Pose(pose, 1.0, StillSide::Both), ..REST }
@@ -113,6 +146,7 @@ fn shots() -> Vec<(&'static str, Shot, Vec<Shot>)> {
         let shot = forehead(posed(pose));
         shots.push((name, shot.clone(), vec![weaker(&shot)]));
     }
+    shots.extend(terms());
     for (name, frame) in [("session_brows", BROWS_RISE), ("session_smile", SMILE_BEGINS), ("session_jaw", JAW_DROPS)] {
         let smoother = Shot { face: Face::Session(frame, Solve::Smoother), ..REST };
         shots.push((name, in_session(frame), vec![REST, smoother]));
@@ -124,6 +158,33 @@ fn shots() -> Vec<(&'static str, Shot, Vec<Shot>)> {
         shots.push((name, shown(Solve::Default), vec![shown(Solve::Smoother), weaker(&shown(Solve::Default))]));
     }
     shots
+}
+
+/// Each term of the light by itself, masks and ways of shapes, the zones' wrinkles, the other set-up of lights; wrong is a
+/// little less or more of what is shown.
+fn terms() -> Vec<(&'static str, Shot, Vec<Shot>)> {
+    let grin = Shot { face: GRIN, ..REST };
+    let viewed = |view: &'static str| Shot { view, ..grin.clone() };
+    let term = |name: &'static str, shot: Shot, skin: SkinSettings| (name, shot.clone(), vec![Shot { skin, ..shot }]);
+    let sunset = Shot { studio: Studio::Sunset, ..REST };
+    let zones = |face: Face| Shot { face, system: WrinkleSystem::Zones, lens: Lens::Forehead, ..REST };
+    let by_zones = |name: &'static str, face: Face| {
+        let bones = Shot { system: WrinkleSystem::Bones, ..zones(face) };
+        (name, zones(face), vec![weaker(&zones(face)), bones])
+    };
+    vec![
+        term("term_diffuse", viewed("diffuse"), SkinSettings { scattering: 0.0, ..SKIN }),
+        term("term_specular", viewed("specular"), SkinSettings { gloss: 0.7, ..SKIN }),
+        term("term_scattering", viewed("scattering"), SkinSettings { scattering: 0.6, ..SKIN }),
+        term("term_translucency", Shot { view: "translucency", ..sunset.clone() }, SkinSettings { translucency: 0.6, ..SKIN }),
+        term("term_blood", viewed("blood"), SkinSettings { blood: 0.6, ..SKIN }),
+        ("view_masks", Shot { view: "masks", ..REST }, vec![Shot { view: "masks:red", ..REST }, Shot { view: "bone-masks", ..REST }]),
+        ("view_bone_masks", Shot { view: "bone-masks", ..REST }, vec![Shot { view: "masks", ..REST }]),
+        ("view_shape_deltas", viewed("shape-deltas"), vec![weaker(&viewed("shape-deltas")), Shot { view: "shape-deltas", ..REST }]),
+        by_zones("zones_surprise", SURPRISE),
+        by_zones("zones_anger", ANGER),
+        ("sunset", sunset.clone(), vec![REST, Shot { key_turn: 12.0, ..sunset }]),
+    ]
 }
 
 pub fn add(add: &mut Add<'_>) {
@@ -159,10 +220,20 @@ pub fn draw(stage: &Stage, shot: &Shot, side: u32) -> anyhow::Result<RgbaImage> 
         Face::Rest => posed(Vec::new())?,
         Face::Pose(pose, amount, side) => posed(posed_points(character, pose, amount, side)?)?,
         Face::Session(index, solve) => session_frame(character, solve, index)?,
+        Face::Expression(expression, weights) => expressed(character, expression, weights)?,
     });
-    frame.influences.iter_mut().for_each(|influence| *influence *= shot.strength);
+    let shapes = frame.shapes.iter_mut().flatten();
+    frame.influences.iter_mut().chain(&mut frame.zones).chain(&mut frame.stretched).chain(shapes).for_each(|value| *value *= shot.strength);
     let camera = camera(character, shot.lens);
-    let settings = DrawSettings { view: ViewMode::parse(shot.view, character)?, blend: shot.blend, ..DrawSettings::new(camera) };
+    let settings = DrawSettings {
+        view: ViewMode::parse(shot.view, character)?,
+        blend: shot.blend,
+        system: shot.system,
+        studio: shot.studio,
+        key_turn: shot.key_turn.to_radians(),
+        skin: shot.skin,
+        ..DrawSettings::new(camera)
+    };
     let mut headless = stage.headless()?;
     Ok(headless.render([side, side], &settings, &frame)?)
 }
@@ -183,6 +254,18 @@ pub fn camera(character: &Character, lens: Lens) -> Camera {
     camera.target = brows + Vec3::Y * above * width;
     camera.distance = 0.5 * seen * width / (0.5 * camera.fovy).tan();
     camera
+}
+
+fn expressed(character: &Arc<Character>, expression: &str, named: &[(&str, f32)]) -> anyhow::Result<FaceFrame> {
+    let mut weights = Box::new([0.0; NUM_ARKIT_SHAPES]);
+    for &(name, weight) in named {
+        weights[ArkitShape::from_name(name).with_context(|| name.to_owned())?.index()] = weight;
+    }
+    let zones = character.zones.as_ref().context("the built-in character has zones")?;
+    let mut amounts = [0.0; MAX_EXPRESSIONS];
+    amounts[zones.expression_index(expression).with_context(|| expression.to_owned())?] = 1.0;
+    let data = TrackingData::Weights { weights, head: None };
+    Ok(solve_first(character, &TrackingFrame { expressions: Some(amounts), ..TrackingFrame::new(0.0, data) })?)
 }
 
 /// Replays the built-in session up to one of its frames.

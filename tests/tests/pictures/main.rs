@@ -11,6 +11,7 @@ mod properties;
 mod read_back;
 mod skin;
 mod twins;
+mod views;
 mod zones;
 
 use libtest_mimic::{Arguments, Trial};
@@ -71,6 +72,7 @@ fn main() -> ExitCode {
     skin::add(&mut add);
     blood::add(&mut add);
     zones::add(&mut add);
+    views::add(&mut add);
     properties::add(&mut add);
     golden::add(&mut add);
     libtest_mimic::run(&arguments, trials).exit_code()

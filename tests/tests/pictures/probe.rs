@@ -2,6 +2,7 @@
 
 use crate::read_back::read_back;
 use rhytid_client::Headless;
+use rhytid_client::renderer::picture_texture;
 use wgpu::util::DeviceExt;
 
 /// Pixels a row where each point is a pixel: point `index` goes to column `index % WIDTH` of row `index / WIDTH`.
@@ -83,16 +84,7 @@ pub fn run(headless: &Headless, probe: &Probe<'_>) -> anyhow::Result<Vec<[f32; 4
         immediate_size: 0,
     });
     let pipeline = pipeline(device, probe, &layout, size[1]);
-    let target = device.create_texture(&wgpu::TextureDescriptor {
-        label: Some("probe"),
-        size: wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: 1 },
-        mip_level_count: 1,
-        sample_count: 1,
-        dimension: wgpu::TextureDimension::D2,
-        format: FORMAT,
-        usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
-        view_formats: &[],
-    });
+    let target = picture_texture(device, "probe", size, FORMAT, wgpu::TextureUsages::COPY_SRC);
     let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("probe") });
     {
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {

@@ -6,6 +6,7 @@ use crate::{Add, Stage};
 use anyhow::ensure;
 use image::RgbaImage;
 use rhytid_client::render_cli::{StillSide, posed_points, solve_one};
+use rhytid_client::renderer::picture_texture;
 use rhytid_client::{Camera, DrawSettings, RenderFrame, Renderer, ViewMode};
 use rhytid_shared::TrackingData;
 use rhytid_shared::limits::MAX_POSES;
@@ -204,16 +205,7 @@ fn targets_encode_alike(stage: &Stage) -> anyhow::Result<()> {
         let settings = DrawSettings { view, ..DrawSettings::new(camera(&stage.asset.character, Lens::Face)) };
         let draw = |format: wgpu::TextureFormat| {
             let mut renderer = Renderer::new(device, queue, &stage.asset, format);
-            let target = device.create_texture(&wgpu::TextureDescriptor {
-                label: Some("test picture"),
-                size: wgpu::Extent3d { width: SIDE, height: SIDE, depth_or_array_layers: 1 },
-                mip_level_count: 1,
-                sample_count: 1,
-                dimension: wgpu::TextureDimension::D2,
-                format,
-                usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
-                view_formats: &[],
-            });
+            let target = picture_texture(device, "test picture", [SIDE; 2], format, wgpu::TextureUsages::COPY_SRC);
             let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("test picture") });
             let seen = target.create_view(&wgpu::TextureViewDescriptor::default());
             renderer.draw(device, queue, &mut encoder, &seen, [SIDE, SIDE], &settings, &frame, None);

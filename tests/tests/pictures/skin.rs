@@ -4,12 +4,15 @@ use crate::probe::{PLACE, Probe, Resource, What, run, texture};
 use crate::{Add, Stage};
 use anyhow::ensure;
 use glam::{Vec3, Vec4};
-use rhytid_client::renderer::{scattering, uniforms};
-use rhytid_client::twin;
+use rhytid_client::asset::{MipChain, Surface, Texels};
+use rhytid_client::renderer::{Term, scattering, uniforms};
+use rhytid_client::{Camera, DrawSettings, RenderFrame, ViewMode, twin};
 
 pub fn add(add: &mut Add<'_>) {
     add("skin::tone_map".into(), Box::new(tone_map));
     add("skin::highlights".into(), Box::new(highlights));
+    add("skin::intensity_of_every_code".into(), Box::new(intensity));
+    add("skin::highlights_follow_the_map_of_intensity".into(), Box::new(mapped_intensity));
     add("skin::transmittance".into(), Box::new(transmittance));
     add("skin::scattering_spreads_light_along_the_surface_only".into(), Box::new(scattering_of_an_edge));
 }
@@ -93,15 +96,55 @@ fn highlights(stage: &Stage) -> anyhow::Result<()> {
             [view.extend(sequence.next(0.05, 0.6)).to_array(), light.extend(0.0).to_array()]
         })
         .collect();
-    let read = function_probe(stage, "vec4<f32>(highlight(vec3<f32>(0.0, 0.0, 1.0), in.a.xyz, in.b.xyz, in.a.w, 0.028))", &cases)?;
+    let call =
+        "vec4<f32>(highlight(vec3<f32>(0.0, 0.0, 1.0), in.a.xyz, in.b.xyz, in.a.w, 0.028), masking(in.a.xyz, in.b.xyz, in.a.w), 0.0, 0.0)";
+    let read = function_probe(stage, call, &cases)?;
     let mut num_bright = 0;
     for ([a, b], got) in cases.iter().zip(read) {
         let (view, light) = (Vec4::from(*a), Vec4::from(*b));
         let twin = twin::skin::highlight(Vec3::Z, view.truncate(), light.truncate(), view.w, 0.028);
         ensure!((got[0] - twin).abs() < 1e-4 + 2e-3 * twin, "view {view}, light {light}: {} on the device, {twin} in the twin", got[0]);
+        let masking = twin::skin::masking(view.truncate(), light.truncate(), view.w);
+        ensure!(
+            (got[1] - masking).abs() < 1e-4,
+            "view {view}, light {light}: {} of it is left on the device, {masking} in the twin",
+            got[1]
+        );
         num_bright += usize::from(twin > 0.05);
     }
     ensure!(num_bright > 50, "only {num_bright} cases show a highlight");
+    Ok(())
+}
+
+fn intensity(stage: &Stage) -> anyhow::Result<()> {
+    let cases: Vec<[[f32; 4]; 2]> = (0..512).map(|i| [[(i % 256) as f32 / 255.0, (i / 256) as f32, 0.0, 0.0], [0.0; 4]]).collect();
+    let read = function_probe(stage, "vec4<f32>(intensity_of(in.a.x, in.a.y))", &cases)?;
+    for (i, got) in read.iter().enumerate() {
+        let twin = twin::skin::intensity((i % 256) as u8, i >= 256);
+        ensure!((got[0] - twin).abs() < 1e-5, "code {i}: {} on the device, {twin} in the twin", got[0]);
+    }
+    Ok(())
+}
+
+/// The view of highlights under maps of one intensity each.
+fn mapped_intensity(stage: &Stage) -> anyhow::Result<()> {
+    let view = |stage: &Stage| -> anyhow::Result<_> {
+        let character = &stage.asset.character;
+        let settings = DrawSettings { view: ViewMode::Term(Term::Specular), ..DrawSettings::new(Camera::front(character)) };
+        let picture = stage.headless()?.render([128, 128], &settings, &RenderFrame::at_rest(character))?;
+        Ok(picture.pixels().map(|pixel| u64::from(pixel[1])).sum::<u64>())
+    };
+    let with = |code: u8| {
+        view(&stage.variant(|asset| {
+            let skin = asset.primitives.iter_mut().filter(|primitive| primitive.surface == Surface::Skin);
+            for material in skin.map(|primitive| &mut primitive.material) {
+                material.surface_map = Some(MipChain::uniform([4, 4], Texels::Linear4, &[255, 128, code, 255]));
+                material.has_intensity = true;
+            }
+        })?)
+    };
+    let [none, half, whole, most] = [with(0)?, with(64)?, with(128)?, with(255)?];
+    ensure!(none * 4 < whole && none < half && half < whole && whole < most, "highlights of {none}, {half}, {whole} and {most} codes");
     Ok(())
 }
 

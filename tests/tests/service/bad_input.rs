@@ -54,7 +54,7 @@ fn bad_frames_are_answered_and_the_session_goes_on() {
         assert!(message.contains(says), "{text}: {message}");
     }
     publisher.socket.send(Message::binary(vec![1, 2, 3])).unwrap();
-    assert_eq!(publisher.error().0, "binary_message");
+    assert_eq!(publisher.error().0, "wrong_length");
     // Still there, and what was bad did not move its clock.
     let mut viewer = server.viewer("demo");
     publisher.send(r#"{"type":"frame","t":1.5,"weights":{"jawOpen":0.5},"unheard":{"of":[1,2]}}"#);
@@ -62,7 +62,7 @@ fn bad_frames_are_answered_and_the_session_goes_on() {
         assert!(viewer.next_packet());
     }
     assert_eq!(viewer.frame.captured_at_micros, 1_500_000);
-    let dropped: f64 = ["malformed_json", "wrong_count", "out_of_range", "time_order", "binary_message"]
+    let dropped: f64 = ["malformed_json", "wrong_count", "out_of_range", "time_order", "wrong_length"]
         .iter()
         .map(|reason| server.metric(&format!("rhytid_frames_dropped_total{{reason=\"{reason}\"}}")))
         .sum();

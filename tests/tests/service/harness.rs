@@ -4,7 +4,7 @@ use rhytid_server::{Identity, ServerConfig, bind, load_character, run};
 use rhytid_shared::FaceFrame;
 use rhytid_shared::packet::{Decoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{JsonFrame, ViewHello, ViewMessage};
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::sync::mpsc;
 use std::thread::JoinHandle;
@@ -228,6 +228,7 @@ pub struct Viewer {
     pub client: Client,
     pub hello: ViewHello,
     pub frame: FaceFrame,
+    pub at_rest: FaceFrame,
     pub num_keys: usize,
     decoder: Decoder,
 }
@@ -240,7 +241,7 @@ impl Viewer {
         // The pong that the ping before the hello asks for.
         client.socket.flush().unwrap();
         let decoder = Decoder::new(PacketLayout::try_from(&hello.character).unwrap());
-        Self { frame: decoder.layout().frame_at_rest(), decoder, hello, client, num_keys: 0 }
+        Self { frame: decoder.layout().frame_at_rest(), at_rest: decoder.layout().frame_at_rest(), decoder, hello, client, num_keys: 0 }
     }
 
     /// The next packet, decoded into `self.frame`; false where the socket closed.
@@ -254,6 +255,22 @@ impl Viewer {
                 }
                 Ok(Message::Close(_)) => return false,
                 Ok(_) => {}
+                Err(error) => panic!("viewer: {error}"),
+            }
+        }
+    }
+
+    /// As [`Self::next_packet`], but false where none comes within the socket's read time-out.
+    pub fn try_packet(&mut self) -> bool {
+        loop {
+            match self.client.socket.read() {
+                Ok(Message::Binary(packet)) => {
+                    self.decoder.decode(&packet, &mut self.frame).expect("every packet can be read when it comes");
+                    return true;
+                }
+                Ok(Message::Close(frame)) => panic!("closed: {frame:?}"),
+                Ok(_) => {}
+                Err(tungstenite::Error::Io(error)) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => return false,
                 Err(error) => panic!("viewer: {error}"),
             }
         }

@@ -21,7 +21,15 @@ fn everything_is_served_at_its_address() {
     let (head, body) = server.get("/healthz", "");
     assert!(head.starts_with("HTTP/1.1 200") && body == b"ok\n", "{head}");
     let (head, body) = server.get("/", "");
-    assert!(head.contains("text/html") && String::from_utf8(body).unwrap().contains("rhytid-client view"), "{head}");
+    // With or without the page in the browser, by what the server was built with.
+    assert!(head.contains("text/html") && String::from_utf8(body).unwrap().contains("<title>Rhytid</title>"), "{head}");
+    let head = head.to_lowercase();
+    assert!(head.contains("content-security-policy: default-src 'none'; ") && !head.contains("'unsafe-eval'"), "{head}");
+    assert!(head.contains("x-content-type-options: nosniff") && head.contains("frame-ancestors 'self'"), "{head}");
+    for outside in ["/../Cargo.toml", "/%2e%2e/Cargo.toml", "/bundle.txt", "//etc/passwd", "/face_mesh", "/index.html/"] {
+        let (head, _) = server.get(outside, "");
+        assert!(head.starts_with("HTTP/1.1 404"), "{outside}: {head}");
+    }
     let (head, body) = server.get(&viewer.hello.character.url, "");
     assert!(head.contains("model/gltf-binary") && body == DEFAULT_CHARACTER_GLB, "{head}");
     let tag = format!("If-None-Match: \"{}\"\r\n", viewer.hello.character.sha256);

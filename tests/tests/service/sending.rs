@@ -24,10 +24,33 @@ fn options(server: &Server, text: String) -> SendOptions {
         speed: f64::INFINITY,
         repeats: false,
         takeover: false,
+        binary: false,
+        profile: None,
         timeout: Duration::from_secs(15),
         trust: Trust::Public,
         token: None,
     }
+}
+
+#[test]
+fn a_feed_sent_in_the_binary_form_gives_nearly_the_same_face() {
+    let lines: Vec<&str> = include_str!("../../../shared/assets/demo.ibug68.jsonl").lines().take(1 + 60).collect();
+    let server = Server::start();
+    let mut last = Vec::new();
+    for (room, binary) in [("text", false), ("bytes", true)] {
+        let mut viewer = server.viewer(room);
+        let options = SendOptions { binary, room: room.into(), ..options(&server, lines.join("\n")) };
+        let before = server.metric("rhytid_in_bytes_total");
+        assert_eq!(send_now(&options).unwrap(), SendReport { frames: 60, errors: 0 });
+        let num_bytes = server.metric("rhytid_in_bytes_total") - before;
+        while viewer.frame.seq < 59 {
+            assert!(viewer.next_packet());
+        }
+        last.push((viewer.frame, num_bytes));
+    }
+    let farthest = last[0].0.points.iter().zip(&last[1].0.points).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
+    assert!(farthest < 2e-4, "{farthest} m apart");
+    assert!(last[1].1 < 0.5 * last[0].1, "{} bytes as text, {} as bytes", last[0].1, last[1].1);
 }
 
 fn send_now(options: &SendOptions) -> Result<SendReport, SendError> {

@@ -3,7 +3,7 @@
 
 use super::obj::{Obj, parse_target};
 use super::source::Source;
-use super::weights::shape;
+use super::weights::{shape, smoothstep};
 use anyhow::{Result, ensure};
 use glam::Vec3;
 use rhytid_shared::ARKIT_NAMES;
@@ -43,8 +43,48 @@ const NEUTRAL_SHAPES: [(&str, f32); 11] = [
 /// over the nose.
 const MOUTH_CLOSE_SHARE: f32 = 0.35;
 
-/// MakeHuman's `tongueOut` moves nothing but the tongue, through the lower lip: mouth and jaw open for it.
-const WITH_TONGUE_OUT: [(&str, f32); 3] = [("jawOpen", 0.40), ("mouthLowerDownLeft", 0.25), ("mouthLowerDownRight", 0.25)];
+/// What goes along with a shape: `(shape, what is added, share)`. MakeHuman's `tongueOut` moves nothing but the tongue, through
+/// the lower lip: mouth and jaw open for it. Its smile lifts the lower lip through the upper one, and a jaw that opens would
+/// show nothing. Lips that are pressed together show less of their red.
+const COMPANIONS: [(&str, &str, f32); 9] = [
+    ("mouthSmileLeft", "mouthLowerDownLeft", 0.28),
+    ("mouthSmileRight", "mouthLowerDownRight", 0.28),
+    ("tongueOut", "jawOpen", 0.40),
+    ("tongueOut", "mouthLowerDownLeft", 0.25),
+    ("tongueOut", "mouthLowerDownRight", 0.25),
+    ("mouthPressLeft", "mouthRollUpper", 0.25),
+    ("mouthPressRight", "mouthRollUpper", 0.25),
+    ("mouthPressLeft", "mouthRollLower", 0.12),
+    ("mouthPressRight", "mouthRollLower", 0.12),
+];
+
+/// By how much a shape is made stronger or weaker than MakeHuman's. Found by a tracker: what it reads of a picture at weight
+/// 1 against what it reads of people at their strongest. A press is half a smile at MakeHuman's strength.
+const SHAPE_STRENGTHS: [(&str, f32); 12] = [
+    ("browInnerUp", 1.4),
+    ("browOuterUpLeft", 1.25),
+    ("browOuterUpRight", 1.25),
+    ("browDownLeft", 1.7),
+    ("browDownRight", 1.7),
+    ("mouthPressLeft", 0.55),
+    ("mouthPressRight", 0.55),
+    ("mouthRollLower", 1.6),
+    ("mouthRollUpper", 1.4),
+    ("mouthShrugLower", 1.35),
+    ("mouthUpperUpLeft", 1.6),
+    ("mouthUpperUpRight", 1.6),
+];
+
+/// MakeHuman's lips are fuller than most: by how much the upper and the lower one are flattened towards the line between them,
+/// and how that fades upwards and downwards (metres), so that nose and chin stay. Tuned by eye and by a tracker, which reads
+/// no lip that rolls in from a full one.
+const SLIMMER_LIPS: [f32; 2] = [0.30, 0.40];
+const LIPS_HEIGHT: f32 = 0.016;
+/// Half the mouth's width, and where beside it nothing is flattened; how far behind the lips' front, metres.
+const LIPS_WIDTH: [f32; 2] = [0.026, 0.040];
+const LIPS_DEPTH: [f32; 2] = [0.012, 0.028];
+/// Vertices of the inner lips' middle, upper and lower.
+const LIPS_MIDDLE: [u32; 2] = [468, 494];
 
 /// Waves of the asymmetry: `(direction and wave number, radians a metre; phase; displacement, metres)`. Long waves, so
 /// that halves differ as halves of a face do and no feature is bent. Tuned by eye; the sum stays below 1.1 mm.
@@ -86,13 +126,14 @@ impl Base {
             if let Some(&(_, weight)) = NEUTRAL_SHAPES.iter().find(|(shape, _)| *shape == name) {
                 deltas.iter().for_each(|&(v, delta)| positions[v as usize] += delta * weight);
             }
-            let share = if name == "mouthClose" { MOUTH_CLOSE_SHARE } else { 1.0 };
+            let stronger = SHAPE_STRENGTHS.iter().find(|(shape, _)| *shape == name).map_or(1.0, |&(_, share)| share);
+            let share = if name == "mouthClose" { MOUTH_CLOSE_SHARE } else { stronger };
             morphs.push(deltas.into_iter().map(|(v, delta)| (v, delta * METRES_PER_UNIT * share)).collect());
         }
 
-        for (name, share) in WITH_TONGUE_OUT {
-            let opening: Vec<(u32, Vec3)> = morphs[shape(name)].iter().map(|&(v, delta)| (v, delta * share)).collect();
-            morphs[shape("tongueOut")].extend(opening);
+        for (name, companion, share) in COMPANIONS {
+            let added: Vec<(u32, Vec3)> = morphs[shape(companion)].iter().map(|&(v, delta)| (v, delta * share)).collect();
+            morphs[shape(name)].extend(added);
         }
 
         let eyes = mean(&positions, &[obj.vertices_of("helper-l-eye"), obj.vertices_of("helper-r-eye")].concat());
@@ -102,6 +143,8 @@ impl Base {
             *position = (*position - origin) * METRES_PER_UNIT;
             *position += asymmetry(*position);
         }
+        let middle = mean(&positions, &LIPS_MIDDLE);
+        positions.iter_mut().for_each(|position| position.y -= flattened(*position - middle));
         Ok(Self { obj, positions, morphs })
     }
 
@@ -116,6 +159,15 @@ impl Base {
 /// Mean position of the listed vertices.
 pub fn mean(positions: &[Vec3], vertices: &[u32]) -> Vec3 {
     vertices.iter().map(|&v| positions[v as usize]).sum::<Vec3>() / vertices.len().max(1) as f32
+}
+
+/// How far down a place goes as the lips are made slimmer; `from_middle` is from the middle of the line between them.
+fn flattened(from_middle: Vec3) -> f32 {
+    let Vec3 { x, y, z } = from_middle;
+    let share = SLIMMER_LIPS[usize::from(y < 0.0)] * libm::expf(-(y * y) / (LIPS_HEIGHT * LIPS_HEIGHT));
+    let beside = 1.0 - smoothstep(LIPS_WIDTH[0], LIPS_WIDTH[1], x.abs());
+    let in_front = 1.0 - smoothstep(LIPS_DEPTH[0], LIPS_DEPTH[1], -z);
+    y * share * beside * in_front
 }
 
 fn asymmetry(position: Vec3) -> Vec3 {

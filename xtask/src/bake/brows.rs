@@ -11,12 +11,12 @@ use rhytid_shared::ARKIT_NAMES;
 /// Middle line of the left brow from the nose outwards, seen from the front: metres from the origin of head space, which
 /// is at the height of the eyes. Higher than MakeHuman's ridge, which a tracker takes for a frown. Tuned by eye and tracker.
 const LINE: [Vec2; 6] = [
-    Vec2::new(0.0125, 0.0135),
-    Vec2::new(0.0225, 0.0160),
-    Vec2::new(0.0330, 0.0185),
-    Vec2::new(0.0430, 0.0181),
-    Vec2::new(0.0505, 0.0149),
-    Vec2::new(0.0565, 0.0096),
+    Vec2::new(0.0125, 0.0094),
+    Vec2::new(0.0225, 0.0120),
+    Vec2::new(0.0330, 0.0146),
+    Vec2::new(0.0430, 0.0147),
+    Vec2::new(0.0505, 0.0122),
+    Vec2::new(0.0565, 0.0078),
 ];
 /// Half the brow's height along the line, metres.
 const HALF_HEIGHT: [f32; 6] = [0.0036, 0.0042, 0.0038, 0.0032, 0.0022, 0.0008];

@@ -182,7 +182,8 @@ pub fn write(contents: Contents<'_>) -> Vec<u8> {
 fn colour(writer: &mut Writer, blood: &BloodMaps) -> schema::Colour {
     let base = writer.texture(&blood.base, "blood");
     let changes = blood.changes.iter().map(|map| schema::ColourChange {
-        pose: map.pose.to_owned(),
+        pose: Some(map.pose.to_owned()),
+        zone: None,
         texture: writer.texture(&map.image, &format!("blood_{}", map.pose)),
         spread: map.spread,
         shift: map.shift,
@@ -227,6 +228,7 @@ fn materials(writer: &mut Writer, painted: &Painted) -> Vec<Value> {
                     },
                     "normalTexture": { "index": slopes, "scale": painted.skin_slopes.scale },
                     "occlusionTexture": { "index": surface },
+                    "extras": { "rhytid_intensity_in_blue": true },
                 }),
                 Material::Eye => json!({
                     "name": name,

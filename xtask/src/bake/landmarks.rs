@@ -19,7 +19,7 @@ pub const IBUG_VERTICES: [u32; NUM_IBUG] = [
 /// The left brow's landmarks from the inner one, seen from the front: metres from the origin of head space. Trackers put
 /// them on the upper border of the hair, which is not where the mesh has vertices.
 pub const BROW: [Vec2; 5] =
-    [Vec2::new(0.0152, 0.0193), Vec2::new(0.0300, 0.0218), Vec2::new(0.0426, 0.0218), Vec2::new(0.0517, 0.0183), Vec2::new(0.0575, 0.0122)];
+    [Vec2::new(0.0152, 0.0152), Vec2::new(0.0300, 0.0178), Vec2::new(0.0426, 0.0183), Vec2::new(0.0517, 0.0154), Vec2::new(0.0575, 0.0102)];
 
 /// Vertices in front of the ears, between which head space has its origin.
 pub const EARS: [u32; 2] = [5402, 12001];

@@ -4,7 +4,7 @@ use super::mesh::Mesh;
 use super::rig::Rig;
 use super::weights::shape;
 use glam::Vec3;
-use rhytid_shared::character::schema::{Drive, Pose};
+use rhytid_shared::character::schema::{Corrective, Drive, Pose};
 use std::collections::BTreeMap;
 
 /// A pose: shapes at a weight (above 1 where the shape is too timid), and the bones it moves by name without `_l`, `_r`.
@@ -90,4 +90,22 @@ impl PoseRecipe {
         let bones = displacements.into_iter().map(|(name, delta)| (rest(&name) + delta, name)).map(|(point, name)| (name, point.into()));
         Pose { name: self.name.to_owned(), bones: bones.collect(), map: None }
     }
+}
+
+/// A jaw that opens by this weight has parted the lips already...
+const PARTED_AT: f32 = 0.12;
+/// ...by so much more than the share of `jawOpen`: our lips rest on each other. Metres up.
+const PARTED_BY: [(&str, f32); 5] =
+    [("lip_lower_mid", -0.0015), ("lip_lower", -0.0014), ("lip_lower_outer", -0.0008), ("lip_upper_mid", 0.0004), ("lip_upper", 0.0003)];
+
+/// What expression weights lack where they are taken in shares.
+pub fn correctives(mesh: &Mesh, rig: &Rig) -> Vec<Corrective> {
+    let skin_bones = rig.bones.iter().filter(|bone| matches!(bone.drive, Drive::Skin { .. }));
+    let bones = skin_bones.zip(&rig.reaches).filter_map(|(bone, reach)| {
+        let stem = bone.name.strip_suffix("_l").or(bone.name.strip_suffix("_r")).unwrap_or(&bone.name);
+        let &(_, up) = PARTED_BY.iter().find(|(name, _)| *name == stem)?;
+        let delta = mesh.morphs[shape("jawOpen")][reach.vertex as usize] * PARTED_AT + Vec3::Y * up;
+        Some((bone.name.clone(), delta.into()))
+    });
+    vec![Corrective { weights: BTreeMap::from([("jawOpen".to_owned(), PARTED_AT)]), bones: bones.collect() }]
 }

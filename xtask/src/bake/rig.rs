@@ -90,8 +90,11 @@ const fn moved(bone: SkinBone, x: f32, y: f32, z: f32) -> SkinBone {
 
 /// Trackers hardly see a smile of ours that is as wide as the performer's: MakeHuman's lips are fuller than most. Found by
 /// measuring a tracker's readings of renders against its readings of performers.
-const CORNER_GAIN: [f32; 3] = [1.6, 1.7, 1.3];
-const UPPER_LIP_GAIN: [f32; 3] = [1.2, 1.5, 1.0];
+const CORNER_GAIN: [f32; 3] = [1.7, 1.8, 1.3];
+const UPPER_LIP_GAIN: [f32; 3] = [1.2, 1.8, 1.0];
+/// Of what the lower lip does beyond the jaw.
+const LOWER_LIP_GAIN: [f32; 3] = [1.1, 1.6, 1.0];
+const BROW_GAIN: [f32; 3] = [1.2, 1.4, 1.0];
 
 /// The forehead's muscle draws the skin up to the hair line.
 const FRONTALIS: &[Pull] = &[pull(0.0, 20.0, 0.80, 34.0), pull(0.0, 38.0, 0.55, 34.0)];
@@ -99,27 +102,27 @@ const FRONTALIS: &[Pull] = &[pull(0.0, 20.0, 0.80, 34.0), pull(0.0, 38.0, 0.55, 
 const CROWS_FEET: &[Pull] = &[pull(21.0, 20.0, 0.75, 34.0)];
 
 const SKIN_BONES: [SkinBone; 16] = [
-    also(bone("brow_inner", &[(22, 0.7), (23, 0.3)], &[(22, 0.7), (23, 0.3)], 0.052), FRONTALIS),
-    also(bone("brow_mid", &[(23, 0.5), (24, 0.5)], &[(23, 0.5), (24, 0.5)], 0.050), FRONTALIS),
-    also(bone("brow_outer", &[(24, 0.35), (25, 0.65)], &[(24, 0.35), (25, 0.65)], 0.048), FRONTALIS),
+    also(stronger(bone("brow_inner", &[(22, 0.7), (23, 0.3)], &[(22, 0.7), (23, 0.3)], 0.052), BROW_GAIN), FRONTALIS),
+    also(stronger(bone("brow_mid", &[(23, 0.5), (24, 0.5)], &[(23, 0.5), (24, 0.5)], 0.050), BROW_GAIN), FRONTALIS),
+    also(stronger(bone("brow_outer", &[(24, 0.35), (25, 0.65)], &[(24, 0.35), (25, 0.65)], 0.048), BROW_GAIN), FRONTALIS),
     bone("brow_tail", &[(26, 1.0)], &[(25, 0.2), (26, 0.8)], 0.042),
     also(moved(bone("cheek", &[(46, 0.6), (47, 0.4)], &[(54, 0.35), (46, 0.25), (55, 0.1)], 0.040), 0.006, -0.024, 0.0), CROWS_FEET),
     moved(bone("nasolabial", &[(35, 0.5), (54, 0.5)], &[(54, 0.5), (35, 0.3)], 0.032), 0.010, 0.002, 0.0),
     also(bone("nose_wing", &[(35, 1.0)], &[(35, 0.8), (34, 0.2)], 0.024), &[pull(-5.0, 15.0, 1.0, 24.0), pull(-6.0, 28.0, 0.8, 22.0)]),
-    stronger(midline(upper_lip(bone("lip_upper_mid", &[(51, 1.0)], &[(51, 0.7), (62, 0.3)], 0.026))), UPPER_LIP_GAIN),
-    stronger(upper_lip(bone("lip_upper", &[(52, 1.0)], &[(52, 0.7), (63, 0.3)], 0.025)), UPPER_LIP_GAIN),
+    stronger(midline(upper_lip(bone("lip_upper_mid", &[(51, 1.0)], &[(51, 0.85), (62, 0.15)], 0.026))), UPPER_LIP_GAIN),
+    stronger(upper_lip(bone("lip_upper", &[(52, 1.0)], &[(52, 0.85), (63, 0.15)], 0.025)), UPPER_LIP_GAIN),
     stronger(upper_lip(bone("lip_upper_outer", &[(53, 1.0)], &[(53, 0.7), (63, 0.15), (54, 0.15)], 0.025)), UPPER_LIP_GAIN),
     stronger(bone("lip_corner", &[(54, 1.0)], &[(54, 0.8), (64, 0.2)], 0.034), CORNER_GAIN),
-    lower_lip(bone("lip_lower_outer", &[(55, 1.0)], &[(55, 0.7), (65, 0.15), (54, 0.15)], 0.025)),
-    lower_lip(bone("lip_lower", &[(56, 1.0)], &[(56, 0.7), (65, 0.3)], 0.025)),
-    midline(lower_lip(bone("lip_lower_mid", &[(57, 1.0)], &[(57, 0.6), (66, 0.4)], 0.026))),
+    stronger(lower_lip(bone("lip_lower_outer", &[(55, 1.0)], &[(55, 0.7), (65, 0.15), (54, 0.15)], 0.025)), LOWER_LIP_GAIN),
+    stronger(lower_lip(bone("lip_lower", &[(56, 1.0)], &[(56, 0.85), (65, 0.15)], 0.025)), LOWER_LIP_GAIN),
+    stronger(midline(lower_lip(bone("lip_lower_mid", &[(57, 1.0)], &[(57, 0.85), (66, 0.15)], 0.026))), LOWER_LIP_GAIN),
     midline(SkinBone {
         turns_with_jaw: true,
         zone: Zone::LowerLip,
         ..moved(bone("chin", &[(8, 1.0)], &[(8, 0.6), (7, 0.2), (9, 0.2)], 0.034), 0.0, 0.012, 0.0)
     }),
     also(
-        midline(bone("glabella", &[(21, 0.5), (22, 0.5)], &[(21, 0.5), (22, 0.5)], 0.024)),
+        stronger(midline(bone("glabella", &[(21, 0.5), (22, 0.5)], &[(21, 0.5), (22, 0.5)], 0.024)), BROW_GAIN),
         &[pull(0.0, 22.0, 0.8, 30.0), pull(0.0, -14.0, 0.6, 18.0)],
     ),
 ];

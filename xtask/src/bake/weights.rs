@@ -46,6 +46,9 @@ const ECHO_HOLD: f32 = 30.0;
 /// How far from the lips' inner corners along the skin both lips move as one, and where they are wholly apart, metres.
 const CORNER_RANGE: [f32; 2] = [0.002_5, 0.008];
 
+/// Half the width of the strip about the midline over which the bones of one side hand over to those of the other, metres.
+const HALVES_BLEND: f32 = 0.004;
+
 /// Joints a vertex of the file can have.
 const NUM_KEPT: usize = 4;
 /// Smaller weights do not show.
@@ -213,7 +216,24 @@ fn skin_fields(skin: &Skin<'_>, rig: &Rig, graph: &[Vec<(u32, f32)>]) -> Vec<Vec
             }
         }
     }
+    part_halves(skin.mesh, rig, &mut fields);
     fields
+}
+
+/// Gives what a bone has beyond the midline to its mirror image: half a face that moves leaves the other alone, and where both
+/// move nothing changes.
+fn part_halves(mesh: &Mesh, rig: &Rig, fields: &mut [Vec<f32>]) {
+    let name = |reach: &Reach| &rig.joints[usize::from(reach.joint)].name;
+    for (left, reach) in rig.reaches.iter().enumerate() {
+        let Some(stem) = name(reach).strip_suffix("_l") else { continue };
+        let Some(right) = rig.reaches.iter().position(|other| name(other).strip_suffix("_r") == Some(stem)) else { continue };
+        for (v, position) in mesh.positions.iter().enumerate() {
+            let (of_left, of_right) = (fields[left][v], fields[right][v]);
+            let share = smoothstep(-HALVES_BLEND, HALVES_BLEND, position.x);
+            fields[left][v] = share * (of_left + of_right);
+            fields[right][v] = (1.0 - share) * (of_left + of_right);
+        }
+    }
 }
 
 /// Influence of a bone's echoes.

@@ -53,7 +53,7 @@ impl Openness {
     }
 }
 
-/// Occlusion in red, roughness in green, metallic (0) in blue.
+/// Occlusion in red, roughness in green, strength of highlights in blue (half is 1): skin is no metal, whatever blue says.
 pub fn paint(atlas: &Atlas, features: &Features, openness: &Openness) -> Result<Encoded> {
     let size = atlas.size();
     let texels = atlas.map(|texel| {
@@ -62,10 +62,10 @@ pub fn paint(atlas: &Atlas, features: &Features, openness: &Openness) -> Result<
         // Short hair lies in its own shadow.
         let lit = libm::powf(openness.at(texel.uv), 0.75) * (1.0 - 0.25 * marks.hair);
         // At rest the corners of the mouth are shut; they are seen when they have opened.
-        [lit.max(CORNER_LIGHT * marks.lip_corner), roughness(texel, &marks)]
+        [lit.max(CORNER_LIGHT * marks.lip_corner), roughness(texel, &marks), 128.0 / 255.0 * intensity(&marks)]
     });
     let code = |x: f32| (x.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
-    let rgb: Vec<u8> = fill_gaps(size, &texels).iter().flat_map(|t| [code(t[0]), code(t[1]), 0]).collect();
+    let rgb: Vec<u8> = fill_gaps(size, &texels).iter().flat_map(|t| t.map(code)).collect();
     encode::jpeg(size, &rgb, 88)
 }
 
@@ -79,6 +79,16 @@ fn roughness(texel: &Texel, marks: &Marks) -> f32 {
     roughness = lerp(roughness, 0.22, marks.waterline.max(0.8 * marks.eye_corner).max(0.6 * marks.lip * marks.lip_gap));
     roughness = lerp(roughness, 0.25, marks.mouth.max(marks.socket));
     lerp(roughness, 0.88, marks.hair.max(0.6 * marks.brow))
+}
+
+/// How strong the skin's highlights are, by its oil: nose and lips shine, cheeks hardly, hair breaks light up. Tuned by eye.
+fn intensity(marks: &Marks) -> f32 {
+    let oily = marks.nose.max(0.45 * marks.forehead).max(0.4 * marks.chin);
+    let mut intensity = lerp(0.85, 1.30, oily);
+    intensity = lerp(intensity, 1.40, marks.lip);
+    intensity = lerp(intensity, 1.50, marks.waterline.max(0.8 * marks.eye_corner));
+    intensity = lerp(intensity, 1.30, marks.mouth.max(marks.socket));
+    lerp(intensity, 0.35, marks.hair.max(0.6 * marks.brow))
 }
 
 /// Nearest distances seen along one direction.

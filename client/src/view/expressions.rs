@@ -1,15 +1,16 @@
 //! Expressions as weights of ARKit's shapes, after the muscles that EMFACS gives each emotion; amounts tuned by eye.
 
-use super::easel::Amounts;
+/// Amounts by name.
+pub(crate) type Amounts = [(&'static str, f32)];
 
 /// An expression by the name that the paper's Table 1.1 has for it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Expression {
-    pub(super) name: &'static str,
-    pub(super) weights: &'static Amounts,
+pub(crate) struct Expression {
+    pub(crate) name: &'static str,
+    pub(crate) weights: &'static Amounts,
 }
 
-pub(super) const JOY: Expression = Expression {
+pub(crate) const JOY: Expression = Expression {
     name: "joy",
     weights: &[
         ("mouthSmileLeft", 0.85),
@@ -25,7 +26,7 @@ pub(super) const JOY: Expression = Expression {
     ],
 };
 
-pub(super) const SURPRISE: Expression = Expression {
+pub(crate) const SURPRISE: Expression = Expression {
     name: "surprise",
     weights: &[
         ("browInnerUp", 0.9),
@@ -37,7 +38,7 @@ pub(super) const SURPRISE: Expression = Expression {
     ],
 };
 
-pub(super) const FEAR: Expression = Expression {
+pub(crate) const FEAR: Expression = Expression {
     name: "fear",
     weights: &[
         ("browInnerUp", 0.95),
@@ -53,7 +54,7 @@ pub(super) const FEAR: Expression = Expression {
     ],
 };
 
-pub(super) const ANGER: Expression = Expression {
+pub(crate) const ANGER: Expression = Expression {
     name: "anger",
     weights: &[
         ("browDownLeft", 1.0),
@@ -69,7 +70,7 @@ pub(super) const ANGER: Expression = Expression {
     ],
 };
 
-pub(super) const DISGUST: Expression = Expression {
+pub(crate) const DISGUST: Expression = Expression {
     name: "disgust",
     weights: &[
         ("noseSneerLeft", 1.0),
@@ -88,7 +89,7 @@ pub(super) const DISGUST: Expression = Expression {
     ],
 };
 
-pub(super) const SAD: Expression = Expression {
+pub(crate) const SAD: Expression = Expression {
     name: "sad",
     weights: &[
         ("browInnerUp", 0.95),
@@ -105,10 +106,11 @@ pub(super) const SAD: Expression = Expression {
 };
 
 /// In the order of the table.
-pub(super) const ALL: [Expression; 6] = [JOY, SURPRISE, FEAR, ANGER, DISGUST, SAD];
+pub(crate) const ALL: [Expression; 6] = [JOY, SURPRISE, FEAR, ANGER, DISGUST, SAD];
 
 /// Many shapes at once, no two halves alike: half a disgusted grin under brows that disagree.
-pub(super) const COMPLEX: Expression = Expression {
+#[cfg(feature = "embedded")]
+pub(crate) const COMPLEX: Expression = Expression {
     name: "complex",
     weights: &[
         ("browOuterUpLeft", 0.95),

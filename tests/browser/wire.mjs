@@ -1,0 +1,82 @@
+// The page's own bytes: publish frames are read back here, packets' heads from bytes written by hand.
+import path from "node:path";
+import { fileURLToPath, pathToFileURL } from "node:url";
+
+const web = path.join(path.dirname(fileURLToPath(import.meta.url)), "../../client/web");
+const load = (name) => import(pathToFileURL(path.join(web, name)).href);
+const { PacketTimes, encodePoints } = await load("wire.js");
+const { Backoff } = await load("util.js");
+const { PuppetFace } = await load("puppet_face.js");
+const { SHAPES, label, mirrored } = await load("names.js");
+
+let numFailed = 0;
+function check(what, isTrue, detail = "") {
+  console.log(`${isTrue ? "ok" : "not ok"} - ${what}${isTrue ? "" : `: ${detail}`}`);
+  if (!isTrue) numFailed += 1;
+}
+
+// Publish frames.
+const points = Float32Array.from({ length: 3 * 478 }, (_, i) => [320 + 90 * Math.sin(i), 240 + 120 * Math.cos(2 * i), 40 * Math.sin(3 * i)][i % 3]);
+const bytes = encodePoints(points, 12.345678);
+const view = new DataView(bytes.buffer);
+check("478 points take 2,896 bytes", bytes.length === 2896, String(bytes.length));
+check("the head says kind, z and count", view.getUint8(0) === 1 && view.getUint8(1) === 1 && view.getUint16(2, true) === 478);
+check("the time is exact", view.getFloat64(4, true) === 12.345678);
+const step = view.getFloat32(24, true);
+let worst = 0;
+points.forEach((value, i) => {
+  const back = view.getFloat32(12 + 4 * (i % 3), true) + step * view.getUint16(28 + 2 * i, true);
+  worst = Math.max(worst, Math.abs(back - value));
+});
+check("points come back within half a step", worst <= 0.51 * step && step < 0.01, `${worst} of ${step}`);
+const flat = new DataView(encodePoints(new Float32Array(9).fill(5), 0).buffer);
+check("points that are all one make a frame too", flat.getFloat32(24, true) > 0 && flat.getUint16(28, true) === 0);
+
+// Heads of packets.
+const times = new PacketTimes();
+const varint = (value) => {
+  const out = [];
+  for (let rest = value; ; rest = Math.floor(rest / 128)) {
+    if (rest < 128) return [...out, rest];
+    out.push((rest % 128) + 128);
+  }
+};
+const key = (session, seq, captured, interval) => Uint8Array.from([0x12, ...varint(session), ...varint(seq), ...varint(captured), ...varint(interval), 9, 9]);
+const delta = (session, seq, distance, zigzag) => Uint8Array.from([0x13, ...varint(session), ...varint(seq), ...varint(distance), ...varint(zigzag), 9]);
+check("a delta before its key says nothing", times.read(delta(1, 5, 1, 0)) === null);
+check("a key says when it was captured", times.read(key(1, 4, 8_123_456_789, 33_333)).micros === 8_123_456_789);
+check("a late delta is late", times.read(delta(1, 7, 3, 10)).micros === 8_123_456_789 + 3 * 33_333 + 5);
+check("an early delta is early", times.read(delta(1, 7, 3, 9)).micros === 8_123_456_789 + 3 * 33_333 - 5);
+check("a delta of another session says nothing", times.read(delta(2, 7, 3, 0)) === null);
+check("bytes that end early say nothing", times.read(Uint8Array.from([0x12, 1, 2, 0x80])) === null && times.read(new Uint8Array()) === null);
+
+// Reconnecting.
+const [shortest, longest] = [new Backoff(() => 0), new Backoff(() => 0.999999)];
+const waits = Array.from({ length: 12 }, () => [shortest.next(), longest.next()]);
+check("the first wait is short, the last no longer than eight seconds", waits[0][1] <= 250 && waits.every(([a, b]) => a <= b && b <= 8000) && waits[11][1] > 7900);
+longest.reset();
+check("a good connection starts the waits anew", longest.next() <= 250);
+
+// The puppet's face.
+const face = new PuppetFace();
+face.setCharacter({ bones: [{ name: "a", rest: [0, 0, 0] }, { name: "b", rest: [1, 0, 0] }], poses: [{ name: "up", bones: { a: [0, 2, 0] } }] });
+face.set("shape:jawOpen", 0.8);
+face.step(1 / 30);
+const first = face.frame(0).weights.jawOpen;
+check("a slider is eased, not jumped to", first > 0.1 && first < 0.5, String(first));
+for (let i = 0; i < 60; i += 1) face.step(1 / 30);
+check("it gets there and rests", face.frame(0).weights.jawOpen === 0.8 && face.step(1 / 30) === false);
+check("a frame names all 52 shapes", Object.keys(face.frame(0).weights).length === 52 && !("expressions" in face.frame(0)));
+face.set("expression:joy", 1);
+for (let i = 0; i < 60; i += 1) face.step(1 / 30);
+check("an expression moves the face and says its name", face.frame(0).weights.mouthSmileLeft === 0.9 && face.frame(0).expressions.joy === 1);
+face.set("pose:up", 0.5);
+face.step(1 / 30);
+check("a pose waits until the shapes are back at rest", "weights" in face.frame(0));
+for (let i = 0; i < 120; i += 1) face.step(1 / 30);
+const { bones } = face.frame(0);
+check("then it moves its own bones as far as it is set", bones && Math.abs(bones.a[1] - 1) < 1e-9 && !("b" in bones), JSON.stringify(face.frame(0)));
+check("every shape has a partner that has it as its own", SHAPES.every((name) => SHAPES.includes(mirrored(name)) && mirrored(mirrored(name)) === name));
+check("eyes that look aside look the same way", mirrored("eyeLookInLeft") === "eyeLookOutRight" && mirrored("jawLeft") === "jawLeft");
+check("labels are words", label("eyeLookUpLeft") === "Look up, left" && label("mouthLeft") === "Mouth, left");
+process.exit(numFailed ? 1 : 0);

@@ -1,0 +1,198 @@
+//! Every parser of trackers' datagrams on a fixed corpus, and on mutations of it that are the same in every run. Longer runs are
+//! cargo-fuzz's, see `tests/fuzz/Cargo.toml`; what those find goes into the corpus.
+
+use glam::{Quat, Vec3};
+use rhytid_server::trackers::fuzz::{TARGETS, join};
+use rhytid_server::trackers::{fmv3, ifacialmocap, livelink, openseeface, vmc, vts};
+use std::panic::catch_unwind;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Mutations of each target, if time is not up before.
+const NUM_MUTATIONS: u32 = 20_000;
+/// For each target: slow machines try fewer.
+const PATIENCE: Duration = Duration::from_secs(6);
+/// Longest input, bytes: a datagram.
+const LONGEST: usize = 65_536;
+
+fn corpus(target: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/corpus").join(target)
+}
+
+/// The corpus of a target, by name.
+fn inputs(target: &str) -> Vec<(String, Vec<u8>)> {
+    let folder = std::fs::read_dir(corpus(target)).unwrap_or_else(|error| panic!("{target} has a corpus: {error}"));
+    let mut inputs: Vec<_> = folder
+        .map(|entry| {
+            let path = entry.expect("the folder can be read").path();
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            (name, std::fs::read(&path).expect("the file can be read"))
+        })
+        .collect();
+    inputs.sort();
+    inputs
+}
+
+fn run(target: fn(&[u8]), name: &str, bytes: &[u8]) {
+    if catch_unwind(|| target(bytes)).is_err() {
+        let hex: String = bytes.iter().take(400).map(|byte| format!("{byte:02x}")).collect();
+        panic!("{name} panicked on {} bytes: {hex}", bytes.len());
+    }
+}
+
+#[test]
+fn the_corpus_breaks_no_parser() {
+    for (name, target) in TARGETS {
+        let inputs = inputs(name);
+        assert!(inputs.len() >= 3, "{name} has {} inputs", inputs.len());
+        for (file, bytes) in &inputs {
+            run(target, &format!("{name} on {file}"), bytes);
+        }
+    }
+}
+
+#[test]
+fn mutations_of_the_corpus_break_no_parser() {
+    for (name, target) in TARGETS {
+        let inputs: Vec<_> = inputs(name).into_iter().map(|(_, bytes)| bytes).collect();
+        let mut random = Random(0x9e37_79b9_7f4a_7c15);
+        let start = Instant::now();
+        let mut done = 0;
+        while done < NUM_MUTATIONS && (done < 1000 || start.elapsed() < PATIENCE) {
+            let bytes = random.mutated(&inputs);
+            run(target, name, &bytes);
+            done += 1;
+        }
+        assert!(done >= 1000);
+    }
+}
+
+/// Marsaglia's xorshift64*: the same numbers everywhere.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        self.0.wrapping_mul(0x2545_f491_4f6c_dd1d)
+    }
+
+    fn below(&mut self, end: usize) -> usize {
+        (self.next() >> 16) as usize % end.max(1)
+    }
+
+    /// One of `inputs` with a few changes.
+    fn mutated(&mut self, inputs: &[Vec<u8>]) -> Vec<u8> {
+        let mut bytes = inputs[self.below(inputs.len())].clone();
+        for _ in 0..=self.below(4) {
+            let at = self.below(bytes.len() + 1);
+            match self.below(8) {
+                0 => bytes.truncate(at),
+                1 => {
+                    let byte = self.next() as u8;
+                    bytes.insert(at, byte);
+                }
+                2 if at < bytes.len() => {
+                    bytes.remove(at);
+                }
+                3 => {
+                    let other = &inputs[self.below(inputs.len())];
+                    let from = self.below(other.len() + 1);
+                    bytes.truncate(at);
+                    bytes.extend(&other[from..]);
+                }
+                // Numbers at which lengths and floats break.
+                4 => {
+                    let numbers: [&[u8]; 8] = [
+                        &[0xff; 4],
+                        &[0; 4],
+                        &[0x7f, 0xff, 0xff, 0xff],
+                        &[0xff, 0xff, 0xff, 0x7f],
+                        &[0x7f, 0xc0, 0, 0],
+                        &[0, 0, 0xc0, 0x7f],
+                        b"1e99",
+                        b"[[[[",
+                    ];
+                    let number = numbers[self.below(numbers.len())];
+                    for (to, from) in bytes.iter_mut().skip(at).zip(number) {
+                        *to = *from;
+                    }
+                }
+                5 => {
+                    let end = (at + self.below(64)).min(bytes.len());
+                    let piece = bytes[at..end].to_vec();
+                    let times = self.below(40);
+                    bytes.splice(at..at, piece.repeat(times));
+                }
+                _ if at < bytes.len() => bytes[at] ^= 1 << self.below(8),
+                _ => {}
+            }
+        }
+        bytes.truncate(LONGEST);
+        bytes
+    }
+}
+
+/// The corpus is what this writes, and what fuzzing has found; `RHYTID_UPDATE_CORPUS=1` writes it.
+#[test]
+fn the_seeds_are_in_the_corpus() {
+    let weights: [f32; 52] = std::array::from_fn(|i| i as f32 / 60.0);
+    let (head, place) = (Quat::from_xyzw(0.1, -0.2, 0.05, 0.97).normalize(), Vec3::new(0.01, -0.05, -0.6));
+    let face = Some((&weights, head, place));
+    let packet = livelink::Packet { device: "A", subject: "B", frame: 1, sub_frame: 0.5, rate: [60, 1], values: None };
+    let with_face = livelink::Packet { values: Some(livelink::values(&weights, head)), ..packet.clone() };
+    let points = std::array::from_fn(|i| [200.0 + i as f32, 300.0 - i as f32]);
+    let one = openseeface::write(1.7e9, [640.0, 480.0], &points, 0.9);
+    let text = |dialect| ifacialmocap::write(dialect, &weights, head, place);
+    let mut phone = fmv3::Sender::new(99);
+    let stream: Vec<Vec<u8>> = phone.schema().into_iter().chain(phone.frame(face)).chain(phone.frame(None)).collect();
+    let bundles = vmc::write(0.5, Some(&weights), head);
+    let joy =
+        b"#bundle\0\0\0\0\0\0\0\0\x01\0\0\0\x20/VMC/Ext/Blend/Val\0\0,sf\0Joy\0\x3f\0\0\0\0\0\0\x1c/VMC/Ext/Blend/Apply\0\0\0\0,\0\0\0";
+    let row = |frame: u32| format!("13:13:04:{frame}.652,61,0.25,0.5,0.1,-0.2,0.05\n");
+    let recording = format!("Timecode,BlendShapeCount,JawOpen,EyeBlinkLeft,HeadYaw,HeadPitch,HeadRoll\n{}{}", row(31), row(33));
+    let joined = |datagrams: &[Vec<u8>]| join(datagrams.iter().map(Vec::as_slice));
+    let seeds: Vec<(&str, &str, Vec<u8>)> = vec![
+        ("openseeface", "face", one.clone()),
+        ("openseeface", "two_faces", [one.clone(), one.clone()].concat()),
+        ("openseeface", "cut", one[..1000].to_vec()),
+        ("livelink", "no_face", packet.write()),
+        ("livelink", "face", with_face.write()),
+        ("livelink", "cut", with_face.write()[..100].to_vec()),
+        ("ifacialmocap", "v1", text(ifacialmocap::Dialect::V1)),
+        ("ifacialmocap", "v2", text(ifacialmocap::Dialect::V2)),
+        ("ifacialmocap", "facemotion3d", text(ifacialmocap::Dialect::Facemotion3d)),
+        ("ifacialmocap", "no_face", ifacialmocap::write_no_face(ifacialmocap::Dialect::V1)),
+        ("ifacialmocap", "hello", ifacialmocap::hello(ifacialmocap::Dialect::V2)),
+        ("fmv3", "stream", joined(&stream)),
+        ("fmv3", "frames", joined(&stream[stream.len() - 2..])),
+        ("fmv3", "hello", joined(&[fmv3::hello(1, 60)])),
+        ("vmc", "face", joined(&bundles)),
+        ("vmc", "joy", join([&joy[..]])),
+        ("vmc", "message", join([&joy[20..52]])),
+        ("vts", "face", vts::write(2500, face)),
+        ("vts", "no_face", vts::write(2500, None)),
+        ("vts", "request", vts::request(21412)),
+        ("livelink_csv", "recording", recording.clone().into_bytes()),
+        ("livelink_csv", "windows", recording.replace('\n', "\r\n").into_bytes()),
+        ("livelink_csv", "header", recording.lines().next().unwrap_or_default().into()),
+        ("sniff", "livelink", with_face.write()),
+        ("sniff", "openseeface", one),
+        ("sniff", "ifacialmocap", text(ifacialmocap::Dialect::V1)),
+        ("sniff", "fmv3", stream[0].clone()),
+        ("sniff", "vmc", joy.to_vec()),
+        ("sniff", "vts", vts::write(2500, face)),
+    ];
+    let updates = std::env::var_os("RHYTID_UPDATE_CORPUS").is_some();
+    for (target, name, bytes) in seeds {
+        let path = corpus(target).join(name);
+        if updates {
+            std::fs::create_dir_all(corpus(target)).expect("the corpus can be written");
+            std::fs::write(&path, &bytes).expect("the corpus can be written");
+        }
+        // Its bytes may differ: machines round angles differently.
+        let kept = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}; RHYTID_UPDATE_CORPUS=1 writes it", path.display()));
+        assert!(!kept.is_empty() && !bytes.is_empty(), "{} is empty", path.display());
+    }
+}
