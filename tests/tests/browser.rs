@@ -67,6 +67,7 @@ fn main() -> ExitCode {
         trial("webgl2_draws_what_the_native_client_draws", can_draw, || compare("webgl")),
         trial("webgpu_draws_what_the_native_client_draws", can_draw, || compare("webgpu")),
         trial("the_page_does_what_it_says", lack.is_none(), the_page_does_what_it_says),
+        trial("the_page_lets_in_who_has_a_token", lack.is_none(), the_page_lets_in_who_has_a_token),
         trial("the_page_survives_the_server", lack.is_none(), the_page_survives_the_server),
         trial("a_face_before_the_camera_moves_another_pages_picture", can_track, || with_film("camera.mjs")),
         trial("the_camera_page_fits_a_performer", can_track, || with_film("wizard.mjs")),
@@ -256,6 +257,16 @@ impl Difference {
 fn the_page_does_what_it_says() -> Result<()> {
     let server = Server::start();
     script("page.mjs", Some(&server), &[])
+}
+
+fn the_page_lets_in_who_has_a_token() -> Result<()> {
+    let folder = tempfile::tempdir()?;
+    let key = folder.path().join("keys");
+    rhytid_server::make_key_file(&key)?;
+    let server = Server::with(|config| config.access.token_key = Some(key.clone()));
+    let make = |role, rooms: &str| rhytid_server::make_token(&key, role, &[rooms.to_owned()], Duration::from_secs(3600));
+    let (view, publish) = (make(rhytid_server::Role::View, "demo")?, make(rhytid_server::Role::Publish, "demo")?);
+    script("access.mjs", Some(&server), &[("RHYTID_VIEW", Path::new(&view)), ("RHYTID_PUBLISH", Path::new(&publish))])
 }
 
 /// Runs a script that shows the film to the browser's camera.
