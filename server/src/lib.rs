@@ -11,6 +11,8 @@ mod config;
 mod control;
 pub mod feed;
 mod fit;
+#[doc(hidden)]
+pub mod fuzz;
 mod http;
 #[cfg(target_os = "linux")]
 pub mod load;
