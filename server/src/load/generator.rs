@@ -24,6 +24,8 @@ const MOST_UNSENT: usize = 64 << 10;
 /// For so long after an event the generator asks for the next one without sleeping: else every send of the server would have to
 /// wake it, which costs the server as much as the send, and which no viewer on another machine asks of it.
 const SPIN: Duration = Duration::from_micros(200);
+/// Share of the warm-up over which the publishers begin, one after the other.
+const STARTS: f64 = 0.5;
 /// Events between two looks at the frames that are due.
 const EVENTS_A_LOOK: usize = 32;
 
@@ -196,8 +198,19 @@ impl<'a> Generator<'a> {
         Ok(generator)
     }
 
-    /// Publishes `fps` frames a second to each room for a time, which is counted where `counts` says so.
+    /// Publishes `fps` frames a second to each room for a time, which is counted where `counts` says so; else it is the warm-up.
     pub fn run(&mut self, fps: f64, time: Duration, counts: bool) -> Result<Option<Seen>, LoadError> {
+        if !counts {
+            // People do not all come in the same instant, nor do what a session does at some age of its own.
+            let (now, step) = (self.start.elapsed().as_secs_f64(), time.as_secs_f64() * STARTS / self.num_rooms as f64);
+            let interval = 1.0 / fps;
+            for (room, due) in self.feed.due.iter_mut().enumerate() {
+                // In whole intervals, and then evenly over one: multiples of the golden ratio.
+                let phase = (room as f64 * 0.618_033_988_75).fract();
+                *due = now + ((room as f64 * step / interval).floor() + phase) * interval;
+            }
+            self.next_due = now;
+        }
         self.seen = counts.then(Seen::new);
         let until = Instant::now() + time;
         while Instant::now() < until {
@@ -248,19 +261,15 @@ impl<'a> Generator<'a> {
         if self.next_due > self.start.elapsed().as_secs_f64() {
             return self.start + Duration::from_secs_f64(self.next_due);
         }
-        // One room after the other, spread over the interval. The schedule is the process's: frames that a pause has missed
-        // are left out, not caught up with.
+        // The schedule is the process's: frames that a pause has missed are left out, not caught up with.
         let mut first = f64::INFINITY;
         for room in 0..self.num_rooms {
             let now = self.start.elapsed().as_secs_f64();
-            let offset = interval * room as f64 / self.num_rooms as f64;
-            let due = self.feed.due[room].max(offset);
+            let due = self.feed.due[room];
             if due <= now {
                 self.publish_one(room);
                 let missed = ((now - due) / interval).floor();
                 self.feed.due[room] = due + interval * (1.0 + missed);
-            } else {
-                self.feed.due[room] = due;
             }
             first = first.min(self.feed.due[room]);
         }
@@ -281,7 +290,10 @@ impl<'a> Generator<'a> {
         }
         self.message.clear();
         let seq = peer.next_seq;
-        self.feed.put(seq, &mut self.message);
+        // Each performer is at another moment of the session: a thousand who do the same at once are a chorus, and the server would
+        // search all their neutral faces anew in the same instant.
+        let moment = seq + room * self.feed.lines.len() / self.num_rooms;
+        self.feed.put(seq, moment, &mut self.message);
         peer.next_seq += 1;
         let is_blocked = !peer.unsent.is_empty();
         put_frame(self.feed.opcode(), &[&self.message], &mut peer.unsent);
@@ -519,13 +531,13 @@ impl Feed<'_> {
         (!self.hello.is_empty()).then_some(self.hello)
     }
 
-    /// Message number `seq` of a publisher.
-    fn put(&self, seq: usize, out: &mut Vec<u8>) {
+    /// Message number `seq` of a publisher, with the face of a `moment` of the session.
+    fn put(&self, seq: usize, moment: usize, out: &mut Vec<u8>) {
         if self.lines.is_empty() {
             put_packet_head(seq, out);
             out.resize(self.packet_bytes, 0xA5);
         } else {
-            let [before, after] = self.lines[seq % self.lines.len()];
+            let [before, after] = self.lines[moment % self.lines.len()];
             out.extend_from_slice(before.as_bytes());
             write!(out, "{:.4}", seq as f64 * self.interval).expect("memory can be written");
             out.extend_from_slice(after.as_bytes());
