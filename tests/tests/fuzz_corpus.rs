@@ -2,7 +2,7 @@
 //! cargo-fuzz's, see `tests/fuzz/Cargo.toml`; what those find goes into the corpus.
 
 #[path = "../../shared/tests/small/mod.rs"]
-#[allow(dead_code, reason = "the character's own tests use the rest")]
+#[allow(dead_code, clippy::unwrap_used, reason = "the character's own tests use the rest, and it is their file")]
 mod small;
 
 use glam::{Quat, Vec3};

@@ -315,7 +315,7 @@ impl<'a> Generator<'a> {
             self.leaving.pop_front();
             let peer = &mut self.peers[at];
             // Every other one says that it goes.
-            if peer.num_connections % 2 == 0
+            if peer.num_connections.is_multiple_of(2)
                 && let Some(stream) = &mut peer.stream
             {
                 let mut close = Vec::new();
