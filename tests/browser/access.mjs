@@ -60,7 +60,7 @@ await run(async () => {
   check("the address is cleared of it", !second.page.url().includes("token"));
   if (!(await second.page.isVisible("#panel"))) await second.page.keyboard.press("h");
   await second.page.click("#tab-puppet");
-  await second.page.locator("#slider-shape-jawOpen").fill("0.5");
+  await second.page.locator("#slider-shape-browInnerUp").fill("0.8");
   await until("a question for another token", () => second.page.isVisible("#access"));
   check("a token to watch does not publish", (await text(second.page, "#access-why")).startsWith("The token is for watching"));
   check("and the face stays in view", (await text(second.page, "#state-text")) === "Live");

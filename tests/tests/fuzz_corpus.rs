@@ -269,6 +269,7 @@ fn own_seeds() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         ("command", "settings", br#"{"type":"settings","mirror":true,"gains":{"brows":1.5},"smoothing":{"head":0}}"#.into()),
         ("command", "fit", br#"{"type":"fit","step":"smile","seconds":1.5}"#.into()),
         ("command", "profile", format!(r#"{{"type":"profile","profile":{profile}}}"#).into()),
+        ("command", "line_break", br#"{"type":"profile","profile":{"rhytid_profile":1,"r\nges":{}}}"#.into()),
         ("profile", "ada", profile.into()),
         ("profile", "least", br#"{"rhytid_profile":1}"#.into()),
         ("profile", "other_version", br#"{"rhytid_profile":2,"neutral":{}}"#.into()),
