@@ -1,7 +1,8 @@
 // The control socket of one source: who speaks over it speaks for that source, whatever sends its frames.
 
+import { protocols } from "./access.js";
 import { Questions } from "./questions.js";
-import { SUBPROTOCOL, socketUrl } from "./util.js";
+import { socketUrl } from "./util.js";
 
 /** Milliseconds within which a connection must be there. */
 const PATIENCE = 10_000;
@@ -20,7 +21,7 @@ export class ControlLink {
   /** @returns {Promise<WebSocket>} rejects with an Error of one sentence */
   #open() {
     this.socket ??= new Promise((resolve, reject) => {
-      const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/control?slot=${encodeURIComponent(this.slot)}`), SUBPROTOCOL);
+      const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/control?slot=${encodeURIComponent(this.slot)}`), protocols());
       const tooLate = setTimeout(() => socket.close(), PATIENCE);
       let problem = "";
       socket.onopen = () => {

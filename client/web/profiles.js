@@ -26,9 +26,13 @@ export async function readProfile(file) {
   return profile;
 }
 
-/** Names of the profiles that the server keeps, and whom they were made of. @returns {Promise<{name: string, source: string}[]>} */
-export async function listProfiles() {
-  const answer = await fetch("/api/profiles");
+/**
+ * Names of the profiles that the server keeps, and whom they were made of.
+ * @param {string} room where one of them is to be used
+ * @returns {Promise<{name: string, source: string}[]>}
+ */
+export async function listProfiles(room) {
+  const answer = await fetch(`/api/profiles?room=${room}`, { headers: headers() });
   if (!answer.ok) throw new Error(`the server answers ${answer.status}`);
   return (await answer.json()).profiles;
 }

@@ -1,7 +1,8 @@
 // The socket that publishes: hello, frames, settings and questions. It comes back by itself, unless somebody else has the room.
 
+import { askForToken, isAboutToken, onToken, protocols, refusal } from "./access.js";
 import { Questions } from "./questions.js";
-import { Backoff, SUBPROTOCOL, socketUrl } from "./util.js";
+import { Backoff, socketUrl } from "./util.js";
 
 /**
  * @typedef {"off" | "connecting" | "ready" | "taken" | "refused" | "lost"} PublishState
@@ -40,6 +41,8 @@ export class PublishLink {
     this.numSkipped = 0;
     this.bytes = 0;
     this.questions = new Questions();
+    /** Ends the waiting for another token. */
+    this.forgetToken = () => {};
   }
 
   /** @param {{takeover?: boolean}} [how] */
@@ -51,6 +54,7 @@ export class PublishLink {
 
   stop() {
     clearTimeout(this.timer);
+    this.forgetToken();
     const socket = this.socket;
     this.socket = null;
     socket?.close();
@@ -62,10 +66,12 @@ export class PublishLink {
   connect(takeover) {
     clearTimeout(this.timer);
     this.#become("connecting", "");
-    const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/publish`), SUBPROTOCOL);
+    const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/publish`), protocols());
     this.socket = socket;
     let last = { code: "", message: "" };
+    let wasOpen = false;
     socket.onopen = () => {
+      wasOpen = true;
       const again = this.wasReadyAt > -Infinity;
       const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true } : {}) };
       socket.send(JSON.stringify(hello));
@@ -89,9 +95,15 @@ export class PublishLink {
       this.questions.heard(message);
       this.listener.message?.(message);
     };
-    socket.onclose = () => {
+    socket.onclose = async () => {
       clearTimeout(tooLate);
       if (this.socket !== socket) return;
+      if (!wasOpen) {
+        const refused = await refusal("publish", this.room);
+        // It may have been stopped meanwhile.
+        if (this.socket !== socket) return;
+        if (refused) last = refused;
+      }
       this.socket = null;
       this.questions.fail(last.message || "the connection was lost");
       if (this.state === "ready") this.wasReadyAt = performance.now();
@@ -107,6 +119,11 @@ export class PublishLink {
       this.#become("taken", message);
     } else if (code && !isTaken && !["shutdown", "idle", "too_many_rooms", "too_many_connections", "hello_timeout"].includes(code)) {
       this.#become("refused", message);
+      if (isAboutToken(code)) {
+        askForToken(message);
+        this.forgetToken();
+        this.forgetToken = onToken(() => this.start());
+      }
     } else {
       this.#become("lost", message || "The server does not answer");
       this.timer = setTimeout(() => this.connect(false), this.backoff.next());

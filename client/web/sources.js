@@ -2,6 +2,7 @@
 
 import { ControlLink } from "./control_link.js";
 import { listProfiles, readProfile, saveProfile } from "./profiles.js";
+import { headers } from "./access.js";
 import { answerOf } from "./questions.js";
 import { Settings } from "./settings.js";
 import { element } from "./util.js";
@@ -69,7 +70,14 @@ export class Sources {
     this.look += 1;
     const mine = this.look;
     try {
-      const { rooms } = await (await fetch("/api/rooms")).json();
+      const answer = await fetch(`/api/rooms?room=${this.room}`, { headers: headers() });
+      if (mine !== this.look) return;
+      if (answer.status === 401 || answer.status === 403) {
+        this.#show([]);
+        say(this.note, "The sources are shown to who may watch this room.");
+        return;
+      }
+      const { rooms } = await answer.json();
       if (mine !== this.look) return;
       const found = rooms.find((/** @type {any} */ room) => room.name === this.room);
       this.#show(found?.sources ?? []);
@@ -244,7 +252,7 @@ class Card {
   async #listProfiles() {
     let names = [];
     try {
-      names = (await listProfiles()).map(({ name }) => name);
+      names = (await listProfiles(this.link.room)).map(({ name }) => name);
     } catch {
       // Files serve without a list.
     }

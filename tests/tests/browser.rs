@@ -69,6 +69,7 @@ fn main() -> ExitCode {
         trial("the_first_picture_comes_soon_with_webgl2", lack.is_none(), || first_picture("webgl")),
         trial("the_first_picture_comes_soon_with_webgpu", lack.is_none(), || first_picture("webgpu")),
         trial("the_page_does_what_it_says", lack.is_none(), || on_a_server("page.mjs")),
+        trial("the_page_lets_in_who_has_a_token", lack.is_none(), the_page_lets_in_who_has_a_token),
         trial("the_page_survives_the_server", lack.is_none(), the_page_survives_the_server),
         trial("a_lost_graphics_device_is_replaced", lack.is_none(), || on_a_server("lost.mjs")),
         trial("publish_to_shown_picture_takes_so_long_with_webgl2", lack.is_none(), || latency("webgl")),
@@ -275,6 +276,16 @@ fn first_picture(backend: &str) -> Result<()> {
 fn latency(backend: &str) -> Result<()> {
     let server = Server::start();
     script("latency.mjs", Some(&server), &[("RHYTID_BACKEND", Path::new(backend))])
+}
+
+fn the_page_lets_in_who_has_a_token() -> Result<()> {
+    let folder = tempfile::tempdir()?;
+    let key = folder.path().join("keys");
+    rhytid_server::make_key_file(&key)?;
+    let server = Server::with(|config| config.access.token_key = Some(key.clone()));
+    let make = |role, rooms: &str| rhytid_server::make_token(&key, role, &[rooms.to_owned()], Duration::from_secs(3600));
+    let (view, publish) = (make(rhytid_server::Role::View, "demo")?, make(rhytid_server::Role::Publish, "demo")?);
+    script("access.mjs", Some(&server), &[("RHYTID_VIEW", Path::new(&view)), ("RHYTID_PUBLISH", Path::new(&publish))])
 }
 
 /// Runs a script that shows the film to the browser's camera.
