@@ -23,6 +23,7 @@ pub mod gallery;
 pub mod link;
 #[cfg(not(target_arch = "wasm32"))]
 mod picture_size;
+mod rate;
 #[cfg(not(target_arch = "wasm32"))]
 mod remote;
 #[cfg(feature = "embedded")]

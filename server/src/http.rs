@@ -1,9 +1,11 @@
 //! What is asked for over HTTP: pages, listings, the character, and the two kinds of WebSocket.
 
+mod recordings;
+
 use crate::config::Access;
-use crate::recording::{PlayError, PlayRequest, RecordError, RecorderStatus};
-use crate::service::{self, Hub, Peer};
-use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
+use crate::service::{Hub, Peer, Place};
+use crate::socket::{Ending, ErrorMessage, Handshake, close, tokens, upgrade};
+use crate::token::{Claims, Refusal, Role, now_seconds};
 use crate::{control, page, publish, viewer};
 use axum::Router;
 use axum::body::Bytes;
@@ -12,9 +14,12 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
+use rhytid_shared::view::TOKEN_PROTOCOL;
 use rhytid_shared::{RoomName, Slot};
 use std::net::IpAddr;
 use std::sync::Arc;
+use std::time::Duration;
+use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
 /// All routes.
@@ -23,10 +28,11 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
         .route("/", get(start_page))
         .route("/healthz", get(async || "ok\n"))
         .route("/metrics", get(metrics))
+        .route("/api/access", get(access))
         .route("/api/rooms", get(rooms))
-        .route("/api/rooms/{room}/record/{action}", post(record))
-        .route("/api/recordings", get(recordings))
-        .route("/api/rooms/{room}/replay", get(replay_status).post(replay).delete(end_replay))
+        .route("/api/rooms/{room}/record/{action}", post(recordings::record))
+        .route("/api/recordings", get(recordings::list))
+        .route("/api/rooms/{room}/replay", get(recordings::status).post(recordings::replay).delete(recordings::end))
         .route("/api/trackers", get(trackers))
         .route("/api/profiles", get(profiles))
         .route("/characters/{file}", get(character))
@@ -106,6 +112,67 @@ fn host_name(host: &str) -> &str {
     }
 }
 
+/// What somebody who was let in may do.
+#[derive(Clone)]
+pub(crate) struct Pass {
+    /// When the token's time is over.
+    pub expires: Option<Instant>,
+    /// The connection's place among all.
+    pub place: Option<Arc<Place>>,
+    /// What the token says, where one is demanded.
+    claims: Option<Claims>,
+}
+
+impl Pass {
+    /// Whether its bearer may act as `role` in `room` too.
+    fn allows(&self, role: Role, room: &RoomName) -> bool {
+        self.claims.as_ref().is_none_or(|claims| claims.allow(role, Some(room)).is_ok())
+    }
+}
+
+/// Lets a request in whose token allows `role`, in `room` where it is about one; or says why not.
+fn admit(hub: &Hub, request: &Request, role: Role, room: Option<&RoomName>) -> Result<Pass, Box<Response>> {
+    let place = request.extensions().get::<Arc<Place>>().cloned();
+    let Some(checker) = &hub.tokens else { return Ok(Pass { expires: None, place, claims: None }) };
+    let is_near = request.extensions().get::<Peer>().is_some_and(|peer| peer.0.ip().to_canonical().is_loopback());
+    let is_safe = hub.is_encrypted || is_near || hub.config.access.insecure;
+    let end = bearer(request.headers()).ok_or(Refusal::Missing).and_then(|token| {
+        // Whoever listens on the way has it by now, but learns not to use it.
+        let claims = if is_safe { checker.check(token)? } else { return Err(Refusal::InTheClear) };
+        Ok((claims.allow(role, room)?, claims))
+    });
+    match end {
+        Ok((end, claims)) => {
+            let expires = Instant::now() + Duration::from_secs(end.saturating_sub(now_seconds()));
+            Ok(Pass { expires: Some(expires), place, claims: Some(claims) })
+        }
+        Err(refusal) => {
+            let (code, words) = refusal.words();
+            hub.metrics.end(code);
+            tracing::warn!(code, peer = ?request.extensions().get::<Peer>(), "request refused");
+            let status = match refusal {
+                Refusal::Missing | Refusal::Bad | Refusal::Expired => StatusCode::UNAUTHORIZED,
+                Refusal::InTheClear | Refusal::Role | Refusal::Room => StatusCode::FORBIDDEN,
+            };
+            let mut answer = ErrorMessage::new(code, words).response(status);
+            if status == StatusCode::UNAUTHORIZED {
+                answer.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
+            }
+            Err(answer.into())
+        }
+    }
+}
+
+/// The token of a request: from its header, or from among the subprotocols, the one place a browser's page can put one for a
+/// WebSocket. Never from the address, which is logged on the way.
+fn bearer(headers: &HeaderMap) -> Option<&str> {
+    let from_header = headers.get(header::AUTHORIZATION).and_then(|value| {
+        let (scheme, token) = value.to_str().ok()?.split_once(' ')?;
+        scheme.eq_ignore_ascii_case("bearer").then(|| token.trim())
+    });
+    from_header.or_else(|| tokens(headers, &header::SEC_WEBSOCKET_PROTOCOL).find_map(|word| word.strip_prefix(TOKEN_PROTOCOL)))
+}
+
 async fn start_page(State(hub): State<Arc<Hub>>, request: Request) -> Response {
     page::answer(request.method(), "/", request.headers(), &hub.config.access).unwrap_or_else(|| page::stand_in(&hub.config.access))
 }
@@ -115,9 +182,37 @@ async fn other(State(hub): State<Arc<Hub>>, request: Request) -> Response {
         .unwrap_or_else(|| ErrorMessage::new("not_found", "there is nothing at this address").response(StatusCode::NOT_FOUND))
 }
 
+/// Whether the bearer of the request's token may act as `role` in `room`, or in all of them. A browser's page, which cannot
+/// read why a socket was refused, asks here.
+async fn access(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    let role = match query_field(&request, "role") {
+        Some("view") => Role::View,
+        Some("publish") => Role::Publish,
+        Some("admin") => Role::Admin,
+        _ => {
+            return ErrorMessage::new("unknown_role", "query field role is expected to be view, publish or admin")
+                .response(StatusCode::BAD_REQUEST);
+        }
+    };
+    let room = match query_field(&request, "room").map(room_name).transpose() {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    match admit(&hub, &request, role, room.as_ref()) {
+        Ok(pass) => {
+            let seconds = pass.expires.map(|end| end.saturating_duration_since(Instant::now()).as_secs());
+            axum::Json(serde_json::json!({ "tokens": hub.tokens.is_some(), "seconds": seconds })).into_response()
+        }
+        Err(answer) => *answer,
+    }
+}
+
 /// In Prometheus's own format, or as OpenMetrics where the reader names that.
-async fn metrics(State(hub): State<Arc<Hub>>, headers: HeaderMap) -> Response {
-    let mut accepted = headers.get_all(header::ACCEPT).into_iter().filter_map(|value| value.to_str().ok());
+async fn metrics(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    if let Err(answer) = admit(&hub, &request, Role::Admin, None) {
+        return *answer;
+    }
+    let mut accepted = request.headers().get_all(header::ACCEPT).into_iter().filter_map(|value| value.to_str().ok());
     let (kind, text) = if accepted.any(|value| value.contains("application/openmetrics-text")) {
         ("application/openmetrics-text; version=1.0.0; charset=utf-8", hub.metrics.open_metrics())
     } else {
@@ -126,131 +221,35 @@ async fn metrics(State(hub): State<Arc<Hub>>, headers: HeaderMap) -> Response {
     ([(header::CONTENT_TYPE, kind)], text).into_response()
 }
 
-async fn rooms(State(hub): State<Arc<Hub>>) -> Response {
-    axum::Json(serde_json::json!({ "rooms": hub.rooms.list() })).into_response()
+/// All rooms, for who may do everything; or the one that the query names, for who may watch it.
+async fn rooms(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    let rooms = match admit_to_listing(&hub, &request, Role::View) {
+        Ok(Some(name)) => hub.rooms.find(&name).iter().map(|room| room.listing()).collect(),
+        Ok(None) => hub.rooms.list(),
+        Err(answer) => return *answer,
+    };
+    axum::Json(serde_json::json!({ "rooms": rooms })).into_response()
 }
 
-/// Begins or ends a recording; answers with its file's name.
-async fn record(State(hub): State<Arc<Hub>>, Path((room, action)): Path<(String, String)>) -> Response {
-    let room = match room_name(&room) {
-        Ok(room) => room,
-        Err(error) => return error.response(StatusCode::BAD_REQUEST),
-    };
-    let answer = |status: RecorderStatus| axum::Json(serde_json::json!({ "recording": status })).into_response();
-    match action.as_str() {
-        "start" => {
-            let place = match hub.rooms.room(&room) {
-                Ok(place) => place,
-                Err(error) => return ErrorMessage::new(error.code(), error.to_string()).response(StatusCode::SERVICE_UNAVAILABLE),
-            };
-            match service::record(&hub, &place).await {
-                Ok(status) => answer(status),
-                Err(error) => {
-                    tracing::warn!(%room, %error, "recording refused");
-                    let (code, status) = match error {
-                        RecordError::NoFolder => ("no_recordings", StatusCode::FORBIDDEN),
-                        RecordError::Running => ("recording_already", StatusCode::CONFLICT),
-                        RecordError::TooMany { .. } => ("too_many_recordings", StatusCode::SERVICE_UNAVAILABLE),
-                        RecordError::Create { .. } | RecordError::Write(_) => ("recording_failed", StatusCode::INTERNAL_SERVER_ERROR),
-                    };
-                    ErrorMessage::new(code, error.to_string()).response(status)
-                }
-            }
-        }
-        "stop" => match hub.rooms.find(&room).and_then(|place| place.end_recording()) {
-            Some(status) => answer(status),
-            None => ErrorMessage::new("not_recording", "the room is not being recorded").response(StatusCode::CONFLICT),
-        },
-        _ => ErrorMessage::new("not_found", "expected record/start or record/stop").response(StatusCode::NOT_FOUND),
+/// Lets in who may see a listing: of the room that the query names, as `role`, or of all there is.
+fn admit_to_listing(hub: &Hub, request: &Request, role: Role) -> Result<Option<RoomName>, Box<Response>> {
+    let room = query_field(request, "room").map(room_name).transpose().map_err(|error| error.response(StatusCode::BAD_REQUEST))?;
+    admit(hub, request, if room.is_some() { role } else { Role::Admin }, room.as_ref())?;
+    Ok(room)
+}
+
+async fn trackers(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    if let Err(answer) = admit(&hub, &request, Role::Admin, None) {
+        return *answer;
     }
-}
-
-/// The recordings in the server's folder, newest first.
-async fn recordings(State(hub): State<Arc<Hub>>) -> Response {
-    let Some(dir) = hub.recorder.dir().map(std::path::Path::to_owned) else {
-        return axum::Json(serde_json::json!({ "recordings": [], "enabled": false })).into_response();
-    };
-    let list = move || {
-        let mut files: Vec<(std::time::SystemTime, String, u64)> = std::fs::read_dir(dir)
-            .into_iter()
-            .flatten()
-            .flatten()
-            .filter_map(|entry| {
-                let name = entry.file_name().into_string().ok().filter(|name| name.ends_with(".mcap"))?;
-                let file = entry.metadata().ok()?;
-                Some((file.modified().ok()?, name, file.len()))
-            })
-            .collect();
-        files.sort_by(|a, b| b.cmp(a));
-        files.truncate(MOST_LISTED);
-        files
-    };
-    let files = tokio::task::spawn_blocking(list).await.unwrap_or_default();
-    let files: Vec<_> = files.into_iter().map(|(_, file, bytes)| serde_json::json!({ "file": file, "bytes": bytes })).collect();
-    axum::Json(serde_json::json!({ "recordings": files, "enabled": true })).into_response()
-}
-
-/// What a page can show of a folder of recordings.
-const MOST_LISTED: usize = 1000;
-
-/// What is played into the room, whether it is recorded, and whether it may be.
-async fn replay_status(State(hub): State<Arc<Hub>>, Path(room): Path<String>) -> Response {
-    match room_name(&room) {
-        Ok(room) => {
-            let recording = hub.rooms.find(&room).and_then(|place| place.recording());
-            let may_record = hub.recorder.dir().is_some();
-            let status = serde_json::json!({ "replay": hub.players.status(&room), "recording": recording, "enabled": may_record });
-            axum::Json(status).into_response()
-        }
-        Err(error) => error.response(StatusCode::BAD_REQUEST),
-    }
-}
-
-/// Plays a recording into the room, or tells its player what to do.
-async fn replay(State(hub): State<Arc<Hub>>, Path(room): Path<String>, body: Bytes) -> Response {
-    let room = match room_name(&room) {
-        Ok(room) => room,
-        Err(error) => return error.response(StatusCode::BAD_REQUEST),
-    };
-    let request: PlayRequest = match serde_json::from_slice(&body) {
-        Ok(request) => request,
-        Err(error) => return ErrorMessage::new("bad_replay", format!("body: {error}")).response(StatusCode::BAD_REQUEST),
-    };
-    // Opening a recording reads its index.
-    match tokio::task::spawn_blocking(move || hub.players.request(&hub, &room, request)).await {
-        Ok(Ok(status)) => axum::Json(serde_json::json!({ "replay": status })).into_response(),
-        Ok(Err(error)) => {
-            let (code, status) = match error {
-                PlayError::Read(_) => ("bad_recording", StatusCode::UNPROCESSABLE_ENTITY),
-                PlayError::Character { .. } => ("other_character", StatusCode::CONFLICT),
-                PlayError::NoPlayer => ("not_playing", StatusCode::CONFLICT),
-                PlayError::NoFolder => ("no_recordings", StatusCode::FORBIDDEN),
-                PlayError::File { .. } => ("no_such_recording", StatusCode::NOT_FOUND),
-                PlayError::Range { .. } => ("bad_replay", StatusCode::BAD_REQUEST),
-                PlayError::TooMany => ("too_many_players", StatusCode::SERVICE_UNAVAILABLE),
-                PlayError::Room(_) => ("room_taken", StatusCode::CONFLICT),
-            };
-            ErrorMessage::new(code, error.to_string()).response(status)
-        }
-        Err(_) => ErrorMessage::new("bad_recording", "it could not be read").response(StatusCode::INTERNAL_SERVER_ERROR),
-    }
-}
-
-async fn end_replay(State(hub): State<Arc<Hub>>, Path(room): Path<String>) -> Response {
-    match room_name(&room) {
-        Ok(room) => match hub.players.stop(&room) {
-            Some(status) => axum::Json(serde_json::json!({ "replay": status })).into_response(),
-            None => ErrorMessage::new("not_playing", "nothing is played in this room").response(StatusCode::CONFLICT),
-        },
-        Err(error) => error.response(StatusCode::BAD_REQUEST),
-    }
-}
-
-async fn trackers(State(hub): State<Arc<Hub>>) -> Response {
     axum::Json(serde_json::json!({ "ports": hub.trackers.list() })).into_response()
 }
 
-async fn profiles(State(hub): State<Arc<Hub>>) -> Response {
+/// For who may do everything, or who publishes to the room that the query names: a publisher chooses one of them by name.
+async fn profiles(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    if let Err(answer) = admit_to_listing(&hub, &request, Role::Publish) {
+        return *answer;
+    }
     axum::Json(serde_json::json!({ "profiles": hub.profiles.list() })).into_response()
 }
 
@@ -282,8 +281,12 @@ async fn publish_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, r
         Ok(handshake) => handshake,
         Err(answer) => return *answer,
     };
+    let pass = match admit(&hub, &request, Role::Publish, Some(&room)) {
+        Ok(pass) => pass,
+        Err(answer) => return *answer,
+    };
     let config = publish::socket_config(&hub);
-    upgrade(&hub.clone(), request, handshake, config, Vec::new(), move |socket| publish::talk(hub, socket, room))
+    upgrade(&hub.clone(), request, handshake, config, Vec::new(), move |socket| publish::talk(hub, socket, room, pass))
 }
 
 async fn control_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
@@ -296,9 +299,14 @@ async fn control_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, r
         Ok(handshake) => handshake,
         Err(answer) => return *answer,
     };
+    // Who speaks for a source may do to its face what its publisher may.
+    let pass = match admit(&hub, &request, Role::Publish, Some(&room)) {
+        Ok(pass) => pass,
+        Err(answer) => return *answer,
+    };
     let config = publish::socket_config(&hub);
     let target = control::Target { hub: hub.clone(), room, slot };
-    upgrade(&hub, request, handshake, config, Vec::new(), move |socket| control::talk(target, socket))
+    upgrade(&hub, request, handshake, config, Vec::new(), move |socket| control::talk(target, socket, pass))
 }
 
 /// A field of the request's query.
@@ -323,12 +331,18 @@ async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, requ
         Ok(handshake) => handshake,
         Err(answer) => return *answer,
     };
+    let pass = match admit(&hub, &request, Role::View, Some(&room)) {
+        Ok(pass) => pass,
+        Err(answer) => return *answer,
+    };
     tracing::debug!(%room, wants_json, peer = ?request.extensions().get::<Peer>(), "viewer connects");
     match hub.rooms.join(&room) {
         Ok(viewing) => {
             let first = viewer::first_frames(&hub, &room);
             let config = viewer::socket_config();
-            upgrade(&hub.clone(), request, handshake, config, first, move |socket| viewer::talk(hub, socket, viewing, wants_json))
+            upgrade(&hub.clone(), request, handshake, config, first, move |socket| {
+                viewer::talk(hub, socket, viewing, wants_json, pass.expires)
+            })
         }
         // A browser's page cannot read the answer to a handshake, so the refusal is a message.
         Err(error) => {

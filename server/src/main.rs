@@ -1,4 +1,8 @@
-//! The server's command line: `serve`, `send`, `fit`, `fake`, and what works on recordings.
+//! The server's command line: `serve`, `send`, `fit`, `fake`, `token`, `load`, and what works on recordings.
+
+#[cfg(target_os = "linux")]
+mod load_command;
+mod token_command;
 
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
@@ -54,6 +58,15 @@ enum Command {
     Fit(FitArgs),
     /// Play another program's tracker from a feed file, to try its protocol without it.
     Fake(FakeArgs),
+    /// Make a token, or a key that signs tokens.
+    Token(token_command::TokenArgs),
+    /// Measure: a server on one core, its publishers and viewers on another.
+    #[cfg(target_os = "linux")]
+    Load(load_command::LoadArgs),
+    /// What `load --baseline` measures against.
+    #[cfg(target_os = "linux")]
+    #[command(hide = true)]
+    PlainServer,
 }
 
 #[derive(Args)]
@@ -74,6 +87,8 @@ struct RecordArgs {
     /// public ones
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     trust: Trust,
+    #[command(flatten)]
+    token: token_command::GivenToken,
 }
 
 #[derive(Args)]
@@ -115,6 +130,8 @@ struct ReplayArgs {
     /// public ones
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     trust: Trust,
+    #[command(flatten)]
+    token: token_command::GivenToken,
 }
 
 #[derive(Args)]
@@ -239,10 +256,12 @@ struct SendArgs {
     /// public ones
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     trust: Trust,
+    #[command(flatten)]
+    token: token_command::GivenToken,
 }
 
 fn parse_trust(text: &str) -> Result<Trust, String> {
-    if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
+    Trust::from_argument(text, |path| std::fs::read(path))
 }
 
 fn parse_profile(text: &str) -> Result<ProfileChoice, String> {
@@ -288,6 +307,8 @@ struct FitArgs {
     /// Whom to trust on wss://, as of `send`.
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     trust: Trust,
+    #[command(flatten)]
+    token: token_command::GivenToken,
 }
 
 fn parse_name(text: &str) -> Result<RoomName, String> {
@@ -360,6 +381,11 @@ async fn main() -> ExitCode {
         Command::Export(args) => export_file(&args),
         Command::Fit(args) => fit(args).await,
         Command::Fake(args) => fake_feed(args).await,
+        Command::Token(args) => token_command::token(&args),
+        #[cfg(target_os = "linux")]
+        Command::Load(args) => load_command::load(args).await,
+        #[cfg(target_os = "linux")]
+        Command::PlainServer => load_command::plain_server().await,
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -405,6 +431,8 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "max-bad-frames": limits.bad_frames_in_a_row,
         "max-connections-in-all": limits.connections,
         "max-connections": limits.connections_per_address,
+        "max-connection-rate": limits.connections_per_second,
+        "max-address-fps": limits.frames_per_second_per_address,
         "hello-timeout": timeouts.hello,
         "ping-interval": timeouts.ping,
         "publisher-timeout": timeouts.publisher_idle,
@@ -422,6 +450,8 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);
     config.access.origins.extend(args.access.origins);
+    config.access.token_key = args.access.token_key.or(config.access.token_key);
+    config.access.insecure |= args.access.insecure;
     // Given by flags it is whole, whatever the file says.
     if args.tls != Tls::default() {
         config.tls = args.tls;
@@ -437,6 +467,7 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
 async fn serve_until_signal(config: ServerConfig, character: (Arc<Character>, Vec<u8>)) -> anyhow::Result<()> {
     let mut interrupt = Signals::new().context("cannot wait for signals")?;
     let listener = bind(&config.listen).await?;
+    config.check_access(listener.local_addr()?)?;
     let identity = Identity::load(&config.tls, listener.local_addr()?, &config.access.hosts)?;
     let scheme = if identity.is_some() { "https" } else { "http" };
     let mut greeting = format!("listening on {scheme}://{}\n", listener.local_addr()?);
@@ -537,6 +568,7 @@ async fn replay_file(args: ReplayArgs) -> anyhow::Result<()> {
             profile: None,
             timeout,
             trust,
+            token: args.token.read()?,
         })
         .await;
     }
@@ -638,6 +670,7 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         profile: args.profile,
         timeout: args.timeout,
         trust: args.trust,
+        token: args.token.read()?,
     };
     send_with_progress(options).await
 }
@@ -656,7 +689,7 @@ async fn send_with_progress(options: SendOptions) -> anyhow::Result<()> {
 }
 
 async fn fit(args: FitArgs) -> anyhow::Result<()> {
-    let FitArgs { feed, out, steps, name, to, room, slot, ready, hold, yes, trust } = args;
+    let FitArgs { feed, out, steps, name, to, room, slot, ready, hold, yes, trust, token } = args;
     let profile = if let Some(feed) = feed {
         let (character, _) = load_character(None)?;
         let report = fit_feed(&feed, &character, steps, name.as_ref(), |line| eprintln!("{line}"))?;
@@ -669,8 +702,8 @@ async fn fit(args: FitArgs) -> anyhow::Result<()> {
         }
         profile
     } else {
-        let options =
-            LiveFit { to, room: room.to_string(), slot: slot.to_string(), name: name.map(|name| name.to_string()), ready, hold, trust };
+        let (room, slot, name) = (room.to_string(), slot.to_string(), name.map(|name| name.to_string()));
+        let options = LiveFit { to, room, slot, name, ready, hold, trust, token: token.read()? };
         fit_live(&options, &mut Terminal { yes }).await?
     };
     write_profile(&profile, &out).with_context(|| format!("cannot write {}", out.display()))?;

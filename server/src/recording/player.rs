@@ -100,6 +100,9 @@ pub enum PlayError {
         /// The name.
         got: String,
     },
+    /// It is of a room that whoever asks may not watch. It is not said of which.
+    #[error("the recording is of another room than the token is for")]
+    Forbidden,
     /// A number outside its range.
     #[error("field {field} is {got}, expected {expected}")]
     Range {
@@ -150,12 +153,18 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Players {
-    /// Does what `request` says in `room`. May read a file.
-    pub fn request(&self, hub: &Arc<Hub>, room: &RoomName, request: PlayRequest) -> Result<PlayStatus, PlayError> {
+    /// Does what `request` says in `room`. May read a file, which is played where `may_watch` says so of the room it was made of.
+    pub fn request(
+        &self,
+        hub: &Arc<Hub>,
+        room: &RoomName,
+        request: PlayRequest,
+        may_watch: &dyn Fn(&RoomName) -> bool,
+    ) -> Result<PlayStatus, PlayError> {
         request.check()?;
         if let Some(file) = &request.file {
             let path = path_of(hub.recorder.dir(), file)?;
-            return self.start(hub, room, &path, request);
+            return self.start(hub, room, &path, request, may_watch);
         }
         let by_room = lock(&self.by_room);
         let handle = by_room.get(room).filter(|handle| lock(&handle.status).error.is_none()).ok_or(PlayError::NoPlayer)?;
@@ -169,10 +178,20 @@ impl Players {
         Ok(status)
     }
 
-    /// Plays the recording at `path` in `room`.
-    pub fn start(&self, hub: &Arc<Hub>, room: &RoomName, path: &Path, request: PlayRequest) -> Result<PlayStatus, PlayError> {
+    /// Plays the recording at `path` in `room`, where `may_watch` says so of the room it was made of.
+    pub fn start(
+        &self,
+        hub: &Arc<Hub>,
+        room: &RoomName,
+        path: &Path,
+        request: PlayRequest,
+        may_watch: &dyn Fn(&RoomName) -> bool,
+    ) -> Result<PlayStatus, PlayError> {
         request.check()?;
         let recording = Recording::open(path)?;
+        if !RoomName::new(recording.room()).is_ok_and(|recorded| may_watch(&recorded)) {
+            return Err(PlayError::Forbidden);
+        }
         if recording.character().sha256 != hub.character.sha256 {
             let (recorded, served) = (recording.character().name.clone(), hub.character.name.clone());
             return Err(PlayError::Character { recorded, served });
