@@ -101,7 +101,7 @@ pub(crate) struct Known {
     pub(crate) replay: Option<(Replay, Instant)>,
     /// Its recording.
     pub(crate) take: Option<Take>,
-    /// The server keeps recordings.
+    /// The server keeps recordings, and whoever watches may make some.
     pub(crate) is_enabled: bool,
     /// Why the last word was not obeyed.
     pub(crate) problem: Option<String>,
@@ -120,12 +120,19 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Remote {
-    /// Watches over `room`; `wake` is called on the thread when something has changed.
-    pub(crate) fn open(server: &ServerAddress, room: &RoomName, trust: &Trust, wake: impl Fn() + Send + 'static) -> Self {
+    /// Watches over `room`; `wake` is called on the thread when something has changed. `token` goes only where nobody else reads it.
+    pub(crate) fn open(
+        server: &ServerAddress,
+        room: &RoomName,
+        trust: &Trust,
+        token: Option<String>,
+        wake: impl Fn() + Send + 'static,
+    ) -> Self {
         let (words, inbox) = channel();
         let known = Arc::<Mutex<Known>>::default();
         let shared = Arc::clone(&known);
-        let line = Line { agent: agent(trust, TIMEOUT), base: server.http_url(&format!("/api/rooms/{room}")) };
+        let bearer = token.filter(|_| server.may_carry_secrets()).map(|token| format!("Bearer {token}"));
+        let line = Line { agent: agent(trust, TIMEOUT), base: server.http_url(&format!("/api/rooms/{room}")), bearer };
         let thread = std::thread::Builder::new().name("remote".into());
         if let Err(error) = thread.spawn(move || line.run(&inbox, &shared, &wake)) {
             tracing::warn!(%error, "no thread for the remote control");
@@ -153,6 +160,13 @@ struct Answer {
     recording: Option<Take>,
     #[serde(default)]
     enabled: bool,
+    /// Servers of before say nothing of it, and whoever watches may.
+    #[serde(default = "yes")]
+    control: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 /// The way to the server.
@@ -160,6 +174,8 @@ struct Line {
     agent: ureq::Agent,
     /// Address of the room.
     base: String,
+    /// What lets it in, where the server wants to know.
+    bearer: Option<String>,
 }
 
 impl Line {
@@ -178,7 +194,7 @@ impl Line {
 
     /// Asks how things stand; true where they change by themselves.
     fn look(&self, known: &Mutex<Known>, wake: &dyn Fn()) -> bool {
-        let request = self.agent.get(format!("{}/replay", self.base));
+        let request = self.with_token(self.agent.get(format!("{}/replay", self.base)));
         let answer = request.config().http_status_as_error(false).build().call();
         let Ok(answer) = read(answer) else {
             // Servers of before know nothing of this, and one that is away is spoken of elsewhere.
@@ -198,7 +214,14 @@ impl Line {
 
     /// A refusal is an answer, too.
     fn post(&self, path: &str) -> ureq::RequestBuilder<ureq::typestate::WithBody> {
-        self.agent.post(format!("{}{path}", self.base)).config().http_status_as_error(false).build()
+        self.with_token(self.agent.post(format!("{}{path}", self.base))).config().http_status_as_error(false).build()
+    }
+
+    fn with_token<Body>(&self, request: ureq::RequestBuilder<Body>) -> ureq::RequestBuilder<Body> {
+        match &self.bearer {
+            Some(bearer) => request.header("Authorization", bearer),
+            None => request,
+        }
     }
 
     /// Does what `word` says, and whatever has been said since: of a slider that is dragged the newest place counts.
@@ -234,7 +257,7 @@ impl Known {
         let now = Instant::now();
         self.replay = answer.replay.filter(|replay| replay.error.is_none()).map(|replay| (replay, now));
         self.take = answer.recording;
-        self.is_enabled = answer.enabled;
+        self.is_enabled = answer.enabled && answer.control;
     }
 }
 
@@ -323,7 +346,7 @@ mod tests {
             });
         });
         let address: ServerAddress = format!("ws://{}", address.recv().unwrap()).parse().unwrap();
-        let remote = Remote::open(&address, &room, &Trust::Public, || ());
+        let remote = Remote::open(&address, &room, &Trust::Public, None, || ());
         let wait_for = |what: &str, is_so: &dyn Fn(&Known) -> bool| {
             let start = Instant::now();
             while !is_so(&remote.known()) {

@@ -39,7 +39,7 @@ pub struct TokenArgs {
 }
 
 impl TokenArgs {
-    fn token(self) -> Option<String> {
+    pub(crate) fn token(self) -> Option<String> {
         let token = self.from_file.or(self.given).or_else(|| std::env::var("RHYTID_TOKEN").ok());
         token.map(|token| token.trim().to_owned()).filter(|token| !token.is_empty())
     }

@@ -130,7 +130,8 @@ pub fn run(args: ViewArgs) -> Result<(), WindowError> {
     let proxy = event_loop.create_proxy();
     // The event loop is gone only when the window is.
     let wake = move || drop(proxy.send_event(Wake));
-    let remote = Remote::open(&args.watch.server, &args.watch.room, &args.watch.trust, wake.clone());
+    let token = args.watch.token.clone().token();
+    let remote = Remote::open(&args.watch.server, &args.watch.room, &args.watch.trust, token, wake.clone());
     let mut app = App {
         remote,
         spectator: Spectator::open(args.watch, Arc::clone(&character), wake),

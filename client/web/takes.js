@@ -1,5 +1,6 @@
 // Recordings: the buttons that make one, the list of those there are, and the play bar of a room that plays one.
 
+import { headers, onToken } from "./access.js";
 import { byId, element, fillTrack } from "./util.js";
 
 /** Milliseconds between two looks at the server: while something plays or is recorded, and while nothing is. */
@@ -45,6 +46,12 @@ export class Takes {
     /** @type {any} and of the recording */
     this.recording = null;
     this.isEnabled = false;
+    /** Whether this page's token lets it record and play here. */
+    this.mayControl = true;
+    /** Whether this page's token does not even let it look. */
+    this.isRefused = false;
+    /** Whether it sees this room's recordings only. */
+    this.isForRoom = false;
     this.saidAt = 0;
     this.timer = 0;
     this.listed = "";
@@ -63,7 +70,11 @@ export class Takes {
     byId("play-position").addEventListener("change", () => this.#drop());
     setInterval(() => this.#move(), STEP);
     document.addEventListener("visibilitychange", () => {
-      if (!document.hidden) this.#look();
+      if (!document.hidden && !this.isRefused) this.#look();
+    });
+    onToken(() => {
+      [this.isRefused, this.isForRoom] = [false, false];
+      this.#look();
     });
   }
 
@@ -73,6 +84,8 @@ export class Takes {
     this.visit += 1;
     this.drag = null;
     [this.replay, this.recording] = [null, null];
+    // A token may be for this room and for no other, or the other way round.
+    this.isRefused = false;
     this.#complain("");
     this.#show();
     this.#look();
@@ -81,7 +94,7 @@ export class Takes {
   /** @param {boolean} isOpen whether its page can be seen */
   setOpen(isOpen) {
     this.isOpen = isOpen;
-    if (isOpen) this.#look();
+    if (isOpen && !this.isRefused) this.#look();
   }
 
   /** Whether there is a player in the room. */
@@ -91,7 +104,7 @@ export class Takes {
 
   /** Plays or stands still; at the end it begins anew. */
   toggle() {
-    if (this.isReplaying) this.#ask({ playing: !this.replay.playing });
+    if (this.isReplaying && this.mayControl) this.#ask({ playing: !this.replay.playing });
   }
 
   /**
@@ -100,7 +113,7 @@ export class Takes {
    */
   async #fetch(path, options) {
     try {
-      const answer = await fetch(path, options);
+      const answer = await fetch(path, { ...options, headers: headers() });
       const body = await answer.json();
       if (answer.ok) return body;
       this.#complain(body.message ?? `The server refused: ${answer.status}`);
@@ -132,10 +145,13 @@ export class Takes {
     const visit = this.visit;
     if (!document.hidden) {
       try {
-        const answer = await fetch(`/api/rooms/${this.room}/replay`);
+        const answer = await fetch(`/api/rooms/${this.room}/replay`, { headers: headers() });
         const said = answer.ok ? await answer.json() : null;
         if (visit !== this.visit) return;
         if (said) this.#take(said);
+        // Without another token the answer stays the same; the view's link asks for one.
+        this.isRefused = answer.status === 401 || answer.status === 403;
+        if (this.isRefused) return;
       } catch {
         // The page says already that the server does not answer.
       }
@@ -152,6 +168,7 @@ export class Takes {
     if (!this.drag) [this.replay, this.saidAt] = [said.replay, performance.now()];
     this.recording = said.recording;
     this.isEnabled = said.enabled;
+    this.mayControl = said.control;
     if (this.recording?.error) this.#complain(`The recording has ended: ${this.recording.error}`);
     this.#show();
   }
@@ -159,11 +176,11 @@ export class Takes {
   #show() {
     const isRecording = this.#isRecording();
     const button = byId("record-button");
-    button.hidden = !this.isEnabled;
+    button.hidden = !this.isEnabled || !this.mayControl;
     button.setAttribute("aria-pressed", String(isRecording));
     button.setAttribute("aria-label", isRecording ? "End the recording" : "Record");
     if (byId("take-problem").hidden) button.title = this.#title();
-    byId("take-button").disabled = !this.isEnabled;
+    byId("take-button").disabled = !this.isEnabled || !this.mayControl;
     byId("take-button").textContent = isRecording ? "Stop" : "Record";
     const text = !this.isEnabled
       ? "This server keeps no recordings: start it with --record DIR."
@@ -174,6 +191,7 @@ export class Takes {
 
     byId("play").hidden = !this.isReplaying;
     if (!this.isReplaying) return;
+    for (const part of ["play-button", "play-position", "play-speed", "play-loop", "play-end"]) byId(part).disabled = !this.mayControl;
     const { playing, speed, loop, from, to, file } = this.replay;
     byId("play").dataset.playing = String(playing);
     byId("play").title = file;
@@ -262,7 +280,12 @@ export class Takes {
   }
 
   async #list() {
-    const said = await this.#fetch("/api/recordings");
+    if (!this.mayControl) {
+      this.listed = "";
+      byId("take-list").replaceChildren(element("li", { class: "quiet" }, "Who may publish to this room sees its recordings."));
+      return;
+    }
+    const said = await this.#recordings();
     if (!said) return;
     const text = JSON.stringify([said.recordings, this.isReplaying && this.replay.file]);
     // Only what changed is drawn anew: a list that is replaced takes the focus away.
@@ -273,6 +296,16 @@ export class Takes {
     list.replaceChildren(...said.recordings.map((/** @type {any} */ recording) => this.#item(recording)));
     if (!said.recordings.length) list.append(element("li", { class: "quiet" }, "None yet."));
     if (focused) /** @type {HTMLElement | null} */ (list.querySelector(`[data-file="${CSS.escape(focused)}"]`))?.focus();
+  }
+
+  /** All recordings, or those of this room where the token is for it alone. */
+  async #recordings() {
+    if (!this.isForRoom) {
+      const answer = await fetch("/api/recordings", { headers: headers() }).catch(() => null);
+      if (answer?.ok) return answer.json();
+      this.isForRoom = answer?.status === 401 || answer?.status === 403;
+    }
+    return this.#fetch(`/api/recordings?room=${this.room}`);
   }
 
   /** @param {{ file: string, bytes: number }} recording */

@@ -1,7 +1,7 @@
 //! `fit`: a performer's profile, from a recorded feed or live, with instructions on the command line.
 
 use crate::feed::{Feed, FeedError, FeedItem};
-use crate::send::{SendError, Socket, connect};
+use crate::send::{MAX_ANSWER, SendError, Socket, connect};
 use crate::solve::{FitError, FitReport, SolveConfig, SolveError, Solver, StepReport};
 use futures_util::{SinkExt, StreamExt};
 use rhytid_shared::trust::Trust;
@@ -193,7 +193,7 @@ enum Answer {
 /// Guides a performer before a live tracker through the fit.
 pub async fn fit_live(options: &LiveFit, guide: &mut impl Guide) -> Result<Profile, FitCliError> {
     let url = format!("{}/v1/rooms/{}/control?slot={}", options.to.trim_end_matches('/'), options.room, options.slot);
-    let mut socket = connect(url, &options.trust, options.token.as_deref(), PATIENCE).await?;
+    let mut socket = connect(url, &options.trust, options.token.as_deref(), PATIENCE, MAX_ANSWER).await?;
     let hold = options.hold.as_secs_f64();
     let num_steps = FitStep::ALL.len();
     for (i, step) in FitStep::ALL.into_iter().enumerate() {

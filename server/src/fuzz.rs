@@ -4,6 +4,7 @@
 use crate::config::ServerConfig;
 use crate::feed::{Feed, FeedItem};
 use crate::pipeline::Pipeline;
+use crate::recording;
 use crate::solve::SolveConfig;
 use crate::token::{Checker, Role};
 use crate::trackers::fuzz::{TARGETS as TRACKERS, Target, datagrams};
@@ -14,7 +15,7 @@ use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, Profile, PublishMessage, P
 use std::sync::{Arc, LazyLock};
 
 /// All entries but those of `trackers::fuzz`, each with what its corpus is called.
-const OWN: [Target; 11] = [
+const OWN: [Target; 13] = [
     ("publish", publish_target),
     ("publish_binary", publish_binary_target),
     ("feed", feed_target),
@@ -26,6 +27,8 @@ const OWN: [Target; 11] = [
     ("config", config_target),
     ("spec", spec_target),
     ("token", token_target),
+    ("recording", recording_target),
+    ("recording_messages", recording_messages_target),
 ];
 
 /// Every entry there is.
@@ -173,4 +176,15 @@ pub fn token_target(bytes: &[u8]) {
     if let Ok(claims) = CHECKER.check(&String::from_utf8_lossy(bytes)) {
         panic!("{claims:?} was signed by nobody and is {:?}", claims.allow(Role::View, None));
     }
+}
+
+/// A recording's file: played, read as feeds and as a table, and solved again.
+pub fn recording_target(bytes: &[u8]) {
+    recording::fuzz::file(bytes, &CHARACTER);
+}
+
+/// The messages of a recording whose file is whole (see `trackers::fuzz::datagrams`): each begins with its channel and the
+/// milliseconds since the one before.
+pub fn recording_messages_target(bytes: &[u8]) {
+    recording::fuzz::messages(bytes, &CHARACTER);
 }

@@ -9,6 +9,7 @@ mod export;
 mod faces;
 mod feed;
 mod format;
+pub(crate) mod fuzz;
 mod player;
 mod reader;
 mod recover;

@@ -22,6 +22,7 @@ use tokio::sync::{oneshot, watch};
 use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::http::{HeaderValue, Uri, header};
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::{self, Message};
 use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
@@ -30,6 +31,9 @@ use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_asyn
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(120);
 /// How long it may take to close when the sender is stopped.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Largest answer of a server: a fit's profile takes a few KB.
+pub(crate) const MAX_ANSWER: usize = 1 << 20;
 
 /// Why a feed could not be sent.
 #[derive(Debug, thiserror::Error)]
@@ -244,7 +248,7 @@ async fn send_once<R: BufRead>(
     let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
     let connected = tokio::select! {
         () = stop.as_mut() => return Ok(Ending::Stopped),
-        connected = connect(url, &options.trust, options.token.as_deref(), options.timeout) => connected?,
+        connected = connect(url, &options.trust, options.token.as_deref(), options.timeout, MAX_ANSWER) => connected?,
     };
     let (mut sink, answers) = connected.split();
     let (ready, is_ready) = oneshot::channel();
@@ -290,8 +294,14 @@ async fn send_once<R: BufRead>(
     }
 }
 
-/// Opens a WebSocket of the server's.
-pub(crate) async fn connect(url: String, trust: &Trust, token: Option<&str>, timeout: Duration) -> Result<Socket, SendError> {
+/// Opens a WebSocket of the server's, on which messages of up to `most_bytes` may come.
+pub(crate) async fn connect(
+    url: String,
+    trust: &Trust,
+    token: Option<&str>,
+    timeout: Duration,
+    most_bytes: usize,
+) -> Result<Socket, SendError> {
     let connecting = async {
         let mut request = url.as_str().into_client_request()?;
         request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
@@ -307,7 +317,8 @@ pub(crate) async fn connect(url: String, trust: &Trust, token: Option<&str>, tim
             request.headers_mut().insert(header::AUTHORIZATION, value);
         }
         let config = trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
-        connect_async_tls_with_config(request, None, false, Some(Connector::Rustls(config))).await
+        let limits = WebSocketConfig::default().max_message_size(Some(most_bytes)).max_frame_size(Some(most_bytes));
+        connect_async_tls_with_config(request, Some(limits), false, Some(Connector::Rustls(config))).await
     };
     let problem = match tokio::time::timeout(timeout, connecting).await {
         Ok(Ok((socket, _))) => return Ok(socket),

@@ -50,9 +50,16 @@ impl Served {
 
     /// Status and body of a GET.
     fn get(&self, path: &str, token: Option<&str>) -> (u16, String) {
+        self.ask("GET", path, token, "")
+    }
+
+    /// Status and body of any request.
+    fn ask(&self, method: &str, path: &str, token: Option<&str>, body: &str) -> (u16, String) {
         let mut stream = TcpStream::connect(("127.0.0.1", self.port)).unwrap();
         let token = token.map(|token| format!("Authorization: Bearer {token}\r\n")).unwrap_or_default();
-        write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{token}\r\n").unwrap();
+        let length = body.len();
+        write!(stream, "{method} {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: {length}\r\n{token}\r\n{body}")
+            .unwrap();
         let mut text = String::new();
         stream.read_to_string(&mut text).unwrap();
         (text[9..12].parse().unwrap(), text.split_once("\r\n\r\n").unwrap().1.to_owned())
@@ -148,6 +155,83 @@ fn sockets_and_pages_open_to_the_right_token_only() {
         let (got, body) = server.get(&format!("/api/access?{query}"), token.map(String::as_str));
         assert!(got == status && body.contains(said), "{query}: {got} {body}");
     }
+}
+
+/// A room's face is in its recordings: they open to no more tokens than the room does.
+#[test]
+fn recordings_open_to_the_right_token_only() {
+    let (key, folder) = (Scratch::new("takes-key"), std::env::temp_dir().join(format!("rhytid-tokens-takes-{}", std::process::id())));
+    std::fs::create_dir_all(&folder).unwrap();
+    make_key_file(&key.0).unwrap();
+    let make = |role, room: &str| make_token(&key.0, role, &[room.to_owned()], Duration::from_secs(60)).unwrap();
+    let (view, publish, other) = (make(Role::View, "demo"), make(Role::Publish, "demo"), make(Role::Publish, "other"));
+    let admin = make(Role::Admin, "*");
+    let shown = folder.to_str().unwrap();
+    let server = Served::start(&["--listen", "127.0.0.1:0", "--token-key", key.shown(), "--record", shown, "--record-rooms", "none"]);
+    let code = |(status, body): (u16, String)| {
+        let said: serde_json::Value = serde_json::from_str(&body).unwrap_or_else(|error| panic!("{error}: {body}"));
+        (status, said["code"].as_str().unwrap_or_default().to_owned())
+    };
+    let (ok, missing) = ((200, String::new()), (401, "token_missing".to_owned()));
+    let (role, room) = ((403, "token_role".to_owned()), (403, "token_room".to_owned()));
+
+    // Who publishes to a room records it.
+    for (token, expected) in [(None, &missing), (Some(&view), &role), (Some(&other), &room), (Some(&publish), &ok)] {
+        let token = token.map(String::as_str);
+        assert_eq!(code(server.ask("POST", "/api/rooms/demo/record/start", token, "")), *expected, "{token:?}");
+    }
+    for (token, expected) in [(None, &missing), (Some(&view), &role), (Some(&other), &room), (Some(&publish), &ok)] {
+        let token = token.map(String::as_str);
+        assert_eq!(code(server.ask("POST", "/api/rooms/demo/record/stop", token, "")), *expected, "{token:?}");
+    }
+    // Which recordings there are, admins see; those of a room, who publishes to it.
+    for (path, token, expected) in [
+        ("/api/recordings", None, &missing),
+        ("/api/recordings", Some(&view), &role),
+        ("/api/recordings", Some(&publish), &role),
+        ("/api/recordings", Some(&admin), &ok),
+        ("/api/recordings?room=demo", Some(&view), &role),
+        ("/api/recordings?room=demo", Some(&other), &room),
+        ("/api/recordings?room=demo", Some(&publish), &ok),
+    ] {
+        assert_eq!(code(server.get(path, token.map(String::as_str))), *expected, "{path} {token:?}");
+    }
+    let listed: serde_json::Value = serde_json::from_str(&server.get("/api/recordings?room=demo", Some(&publish)).1).unwrap();
+    let file = listed["recordings"][0]["file"].as_str().unwrap().to_owned();
+    let of_other: serde_json::Value = serde_json::from_str(&server.get("/api/recordings?room=other", Some(&other)).1).unwrap();
+    assert!(file.starts_with("demo-") && of_other["recordings"].as_array().unwrap().is_empty(), "{of_other}");
+
+    // What is played into a room, whoever watches it may know; who plays must publish there, and may watch what is played.
+    for (token, expected) in [(None, &missing), (Some(&other), &room), (Some(&view), &ok)] {
+        assert_eq!(code(server.get("/api/rooms/demo/replay", token.map(String::as_str))), *expected, "{token:?}");
+    }
+    assert!(server.get("/api/rooms/demo/replay", Some(&view)).1.contains("\"control\":false"));
+    assert!(server.get("/api/rooms/demo/replay", Some(&publish)).1.contains("\"control\":true"));
+    let body = serde_json::json!({ "file": file }).to_string();
+    let played = |path: &str, token: Option<&String>| code(server.ask("POST", path, token.map(String::as_str), &body));
+    assert_eq!(played("/api/rooms/demo/replay", None), missing);
+    assert_eq!(played("/api/rooms/demo/replay", Some(&view)), role);
+    assert_eq!(played("/api/rooms/demo/replay", Some(&other)), room);
+    assert_eq!(played("/api/rooms/other/replay", Some(&other)), room, "a recording of another room");
+    assert_eq!(played("/api/rooms/other/replay", Some(&admin)), ok);
+    assert_eq!(played("/api/rooms/demo/replay", Some(&publish)), ok);
+    for (token, expected) in [(None, &missing), (Some(&view), &role), (Some(&other), &room), (Some(&publish), &ok)] {
+        let token = token.map(String::as_str);
+        assert_eq!(code(server.ask("DELETE", "/api/rooms/demo/replay", token, "")), *expected, "{token:?}");
+    }
+    // A program records as a viewer, with a token as every other.
+    let out = folder.join("taken.mcap");
+    let record = |token: &[&str]| {
+        let to = format!("ws://localhost:{}", server.port);
+        let args = ["record", out.to_str().unwrap(), "--seconds", "0.3", "--server", &to];
+        Command::new(PROGRAM).args(args).args(token).env_remove("RHYTID_TOKEN").output().unwrap()
+    };
+    let refused = record(&[]);
+    assert!(!refused.status.success() && String::from_utf8_lossy(&refused.stderr).contains("a token is needed"), "{refused:?}");
+    let taken = record(&["--token", &view]);
+    assert!(taken.status.success(), "{taken:?}");
+    drop(server);
+    std::fs::remove_dir_all(&folder).unwrap();
 }
 
 #[test]

@@ -8,11 +8,13 @@ mod small;
 use glam::{Quat, Vec3};
 use rhytid_server::fuzz::targets;
 use rhytid_server::pipeline::Pipeline;
+use rhytid_server::recording::{Recording, RecordingWriter, SessionEvent, Topic};
 use rhytid_server::solve::SolveConfig;
 use rhytid_server::trackers::fuzz::join;
 use rhytid_server::trackers::{fmv3, ifacialmocap, livelink, openseeface, vmc, vts};
+use rhytid_shared::packet::PacketLayout;
 use rhytid_shared::view::{ViewHello, ViewMessage};
-use rhytid_shared::{Character, DEFAULT_CHARACTER_GLB, PublishHello, TrackingData, TrackingFrame, encode_landmarks};
+use rhytid_shared::{ARKIT_NAMES, Character, DEFAULT_CHARACTER_GLB, PublishHello, TrackingData, TrackingFrame, encode_landmarks};
 use small::Glb;
 use std::panic::catch_unwind;
 use std::path::{Path, PathBuf};
@@ -163,6 +165,7 @@ fn the_seeds_are_in_the_corpus() {
         b"#bundle\0\0\0\0\0\0\0\0\x01\0\0\0\x20/VMC/Ext/Blend/Val\0\0,sf\0Joy\0\x3f\0\0\0\0\0\0\x1c/VMC/Ext/Blend/Apply\0\0\0\0,\0\0\0";
     let row = |frame: u32| format!("13:13:04:{frame}.652,61,0.25,0.5,0.1,-0.2,0.05\n");
     let recording = format!("Timecode,BlendShapeCount,JawOpen,EyeBlinkLeft,HeadYaw,HeadPitch,HeadRoll\n{}{}", row(31), row(33));
+    let log = openseeface_log(&[(10.0, 0), (10.0, 1), (10.04, 0), (12.0, 0)]);
     let joined = |datagrams: &[Vec<u8>]| join(datagrams.iter().map(Vec::as_slice));
     let seeds: Vec<(&str, &str, Vec<u8>)> = vec![
         ("openseeface", "face", one.clone()),
@@ -188,6 +191,9 @@ fn the_seeds_are_in_the_corpus() {
         ("livelink_csv", "recording", recording.clone().into_bytes()),
         ("livelink_csv", "windows", recording.replace('\n', "\r\n").into_bytes()),
         ("livelink_csv", "header", recording.lines().next().unwrap_or_default().into()),
+        ("openseeface_csv", "log", log.clone().into_bytes()),
+        ("openseeface_csv", "windows", log.replace('\n', "\r\n").into_bytes()),
+        ("openseeface_csv", "header", log.lines().next().unwrap_or_default().into()),
         ("sniff", "livelink", with_face.write()),
         ("sniff", "openseeface", one),
         ("sniff", "ifacialmocap", text(ifacialmocap::Dialect::V1)),
@@ -195,7 +201,7 @@ fn the_seeds_are_in_the_corpus() {
         ("sniff", "vmc", joy.to_vec()),
         ("sniff", "vts", vts::write(2500, face)),
     ];
-    let seeds = seeds.into_iter().chain(own_seeds());
+    let seeds = seeds.into_iter().chain(own_seeds()).chain(recordings());
     let updates = std::env::var_os("RHYTID_UPDATE_CORPUS").is_some();
     for (target, name, bytes) in seeds {
         let path = corpus(target).join(name);
@@ -296,5 +302,96 @@ fn own_seeds() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         ("token", "foreign", token.into()),
         ("token", "unsigned", b"eyJhbGciOiJub25lIn0.eyJyb2xlIjoiYWRtaW4iLCJyb29tcyI6WyIqIl0sImV4cCI6NDAwMDAwMDAwMH0.".into()),
         ("token", "cut", token[..80].into()),
+    ]
+}
+
+/// A log of OpenSeeFace's with a row for each time and number of a face.
+fn openseeface_log(rows: &[(f64, u32)]) -> String {
+    let first = "Frame,Time,Width,Height,FPS,Face,FaceID,RightOpen,LeftOpen,AverageConfidence,Success3D,PnPError";
+    let fit = "RotationQuat.X,RotationQuat.Y,RotationQuat.Z,RotationQuat.W,Euler.X,Euler.Y,Euler.Z,RVec.X,RVec.Y,RVec.Z";
+    let names: String = (0..66).map(|i| format!(",Landmark[{i}].X,Landmark[{i}].Y,Landmark[{i}].Confidence")).collect();
+    let row = |&(t, face): &(f64, u32)| {
+        let landmarks: String = (0..68).map(|i| format!(",{},{},0.5", 100 + i, 50 + i)).collect();
+        format!("1,{t},640,480,24,{face},0,1,0.9,0.8,True,[0.3],0,0,0,1,0,0,0,[1],[2],[3],0,0,5{landmarks}\n")
+    };
+    format!("{first},{fit},TVec.X,TVec.Y,TVec.Z{names}\n{}", rows.iter().map(row).collect::<String>())
+}
+
+/// A short recording, whole and not, and its messages by themselves.
+fn recordings() -> Vec<(&'static str, &'static str, Vec<u8>)> {
+    const BEGIN: u64 = 1_700_000_000_000_000_000;
+    let character = Arc::new(Character::from_glb(DEFAULT_CHARACTER_GLB).expect("the built-in character is whole"));
+    let mut file = Vec::new();
+    let mut writer = RecordingWriter::to(&mut file, PacketLayout::from(&*character)).expect("memory can be written");
+    let hello = ViewHello::new("demo", &character, String::new()).character;
+    let (room, server) = ("demo".into(), "0.1.0".into());
+    let begin = SessionEvent::Recording { version: 1, room, server, character: Box::new(hello), clock: BEGIN };
+    writer.event(BEGIN, &begin).expect("memory can be written");
+    let (slot, source, solve) = ("main".to_owned(), "fuzz".to_owned(), SolveConfig::default());
+    let mut pipeline = Pipeline::new(character.clone(), &solve, &PublishHello::default(), 1).expect("the default hello is sound");
+    let start = SessionEvent::Start {
+        session: 1,
+        slot: slot.clone(),
+        source,
+        under_way: false,
+        kept_neutral: None,
+        profile: None,
+        solve: Some(Box::new(solve)),
+    };
+    writer.event(BEGIN, &start).expect("memory can be written");
+    let text = Topic::Text(slot.clone());
+    writer.message(&text, BEGIN, None, br#"{"type":"hello","version":1}"#).expect("memory can be written");
+    let jaw_open = ARKIT_NAMES.iter().position(|name| *name == "jawOpen").expect("a name of ARKit's");
+    let mut packet = Vec::new();
+    for k in 0..8_u8 {
+        let (t, at) = (f64::from(k) / 25.0, BEGIN + u64::from(k) * 40_000_000);
+        if k == 4 {
+            let change = br#"{"type":"settings","gains":{"brows":1.5}}"#;
+            writer.message(&Topic::Control(slot.clone()), at, None, change).expect("memory can be written");
+        }
+        let message = format!(r#"{{"type":"frame","t":{t},"weights":{{"jawOpen":{}}}}}"#, f64::from(k) / 8.0);
+        writer.message(&text, at, Some(t), message.as_bytes()).expect("memory can be written");
+        let mut weights = Box::new([0.0; 52]);
+        weights[jaw_open] = f32::from(k) / 8.0;
+        pipeline.frame(&TrackingFrame::new(t, TrackingData::Weights { weights, head: None }), &mut packet).expect("the frame is sound");
+        writer.packet(at, packet.clone().into());
+    }
+    writer.flush().expect("memory can be written");
+    let end = BEGIN + 400_000_000;
+    writer.message(&Topic::Refused(slot), end, None, b"no message").expect("memory can be written");
+    writer.event(end, &SessionEvent::End { session: 1, frames: 8 }).expect("memory can be written");
+    writer.event(end, &SessionEvent::Gap { messages: 3 }).expect("memory can be written");
+    writer.finish().expect("memory can be written");
+
+    let mut recording = Recording::from_bytes(file.clone(), "seed".into()).expect("it was just written");
+    let (mut messages, mut last) = (Vec::new(), BEGIN);
+    for index in 0..recording.chunks().len() {
+        // What the file begins with is the target's own.
+        for entry in recording.read_chunk(index).expect("it was just written").into_iter().skip(usize::from(index == 0)) {
+            let channel = match entry.topic {
+                Topic::Session => 0,
+                Topic::Packets => 1,
+                Topic::Text(_) => 2,
+                Topic::Binary(_) => 4,
+                Topic::Control(_) => 5,
+                Topic::Refused(_) => 7,
+            };
+            let mut message = vec![channel, (entry.log_time.saturating_sub(last) / 1_000_000) as u8];
+            message.extend(entry.data);
+            last = entry.log_time.max(last);
+            messages.push(message);
+        }
+    }
+    let joined = |messages: &[Vec<u8>]| join(messages.iter().map(Vec::as_slice));
+    let mut damaged = file.clone();
+    let middle = damaged.len() / 2;
+    damaged[middle] ^= 1;
+    vec![
+        ("recording", "cut", file[..file.len() * 2 / 3].into()),
+        ("recording", "damaged", damaged),
+        ("recording", "whole", file),
+        ("recording_messages", "whole", joined(&messages)),
+        ("recording_messages", "begun_before", joined(&messages[2..])),
+        ("recording_messages", "start", joined(&messages[..4])),
     ]
 }

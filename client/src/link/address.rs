@@ -45,7 +45,7 @@ impl ServerAddress {
     }
 
     /// Nobody else can read what goes there.
-    pub(super) fn may_carry_secrets(&self) -> bool {
+    pub(crate) fn may_carry_secrets(&self) -> bool {
         let is_here = self.host_and_port().0.parse::<std::net::IpAddr>().is_ok_and(|address| address.is_loopback());
         self.is_encrypted || is_here || self.host == "localhost"
     }

@@ -10,7 +10,7 @@ use rhytid_shared::packet::{BatchError, BatchReader, PacketError, PacketLayout};
 use rhytid_shared::view::CharacterHello;
 use std::collections::HashMap;
 use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom};
+use std::io::{self, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
 /// A record's opcode and length.
@@ -57,13 +57,15 @@ pub struct ChunkPlace {
     pub end: u64,
 }
 
+/// What a recording is read from.
+pub(super) trait Bytes: Read + Seek + Send {}
+
+impl<T: Read + Seek + Send> Bytes for T {}
+
 /// An open recording.
 pub struct Recording {
-    file: File,
-    path: String,
-    length: u64,
+    source: Source,
     chunks: Vec<ChunkPlace>,
-    channels: HashMap<u16, Option<Topic>>,
     room: String,
     server: String,
     character: CharacterHello,
@@ -78,15 +80,27 @@ impl Recording {
     pub fn open(path: &Path) -> Result<Self, ReadError> {
         let shown = path.display().to_string();
         let io = |source| ReadError::Io { path: shown.clone(), source };
-        let mut file = File::open(path).map_err(io)?;
+        let file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
+        Self::read(Box::new(file), length, shown)
+    }
+
+    /// The same of a file's bytes, which are called `name` in errors.
+    pub fn from_bytes(bytes: Vec<u8>, name: String) -> Result<Self, ReadError> {
+        let length = bytes.len() as u64;
+        Self::read(Box::new(Cursor::new(bytes)), length, name)
+    }
+
+    fn read(mut file: Box<dyn Bytes>, length: u64, path: String) -> Result<Self, ReadError> {
+        let shown = path.clone();
+        let io = |source| ReadError::Io { path: shown.clone(), source };
         let broken = |problem: String| ReadError::Broken { path: shown.clone(), problem };
         let mut magic = [0; MAGIC.len()];
         if length < MAGIC.len() as u64 || file.read_exact(&mut magic).is_err() || magic != *MAGIC {
             return Err(broken("it is no MCAP file".into()));
         }
         let mut channels = HashMap::new();
-        let (mut chunks, cut_at) = match read_summary(&mut file, length) {
+        let (mut chunks, cut_at) = match read_summary(&mut *file, length) {
             Ok(Some(summary)) => {
                 channels.extend(summary.channels.iter().map(|(id, channel)| (*id, Topic::parse(&channel.topic))));
                 let chunks = summary.chunk_indexes.iter().map(|index| ChunkPlace {
@@ -98,7 +112,7 @@ impl Recording {
                 (chunks.collect(), None)
             }
             Ok(None) | Err(_) => {
-                let (chunks, end) = scan(&mut file, length).map_err(io)?;
+                let (chunks, end) = scan(&mut *file, length).map_err(io)?;
                 (chunks, Some(end))
             }
         };
@@ -106,26 +120,24 @@ impl Recording {
             return Err(broken(format!("it has {} chunks, expected up to {MAX_CHUNKS}", chunks.len())));
         }
         chunks.sort_by_key(|chunk: &ChunkPlace| chunk.offset);
-        let mut recording = Unchecked { file, path: shown, length, channels };
+        let mut source = Source { file, path, length, channels };
         let mut first = None;
         // Channels stand where they were first used; a finished file lists them at its end as well.
         let until = if cut_at.is_some() { chunks.len() } else { 1 };
         for (index, chunk) in chunks.iter().take(until).enumerate() {
-            match recording.read(chunk) {
+            match source.read(chunk) {
                 Ok(entries) if index == 0 => first = entries.into_iter().next(),
                 Err(error) if index == 0 => return Err(error),
                 // Those that are damaged say so when they are read.
                 _ => {}
             }
         }
-        let Unchecked { file, path, length, channels } = recording;
-        let broken = |problem: String| ReadError::Broken { path: path.clone(), problem };
         let first = first.filter(|first| first.topic == Topic::Session);
         let first = first.ok_or_else(|| broken(format!("its first message is none of a {PROFILE} recording")))?;
         match serde_json::from_slice(&first.data) {
             Ok(SessionEvent::Recording { version: VERSION, room, server, character, clock }) => {
                 let layout = PacketLayout::try_from(&*character).map_err(|error: PacketError| broken(error.to_string()))?;
-                Ok(Self { file, path, length, chunks, channels, room, server, character: *character, layout, clock, cut_at })
+                Ok(Self { source, chunks, room, server, character: *character, layout, clock, cut_at })
             }
             Ok(SessionEvent::Recording { version, .. }) => Err(broken(format!("it is of version {version}, expected {VERSION}"))),
             Ok(_) => Err(broken("its first message says nothing about it".into())),
@@ -135,7 +147,7 @@ impl Recording {
 
     /// The file as it was named.
     pub fn path(&self) -> &str {
-        &self.path
+        &self.source.path
     }
 
     /// The room.
@@ -170,7 +182,7 @@ impl Recording {
 
     /// Bytes that make no whole chunk at the end of a file that was not finished; nothing for one that was.
     pub fn cut_off(&self) -> Option<u64> {
-        self.cut_at.map(|end| self.length - end)
+        self.cut_at.map(|end| self.source.length - end)
     }
 
     /// When it begins, Unix clock, ns.
@@ -187,15 +199,7 @@ impl Recording {
     /// The messages of chunk `index`, in their order.
     pub fn read_chunk(&mut self, index: usize) -> Result<Vec<Entry>, ReadError> {
         let chunk = self.chunks[index];
-        let mut source = Unchecked {
-            file: self.file.try_clone().map_err(|source| ReadError::Io { path: self.path.clone(), source })?,
-            path: self.path.clone(),
-            length: self.length,
-            channels: std::mem::take(&mut self.channels),
-        };
-        let entries = source.read(&chunk);
-        self.channels = source.channels;
-        entries
+        self.source.read(&chunk)
     }
 
     /// Index of the first chunk from which packets can be read so that the first of those at `from` (Unix clock, ns) or later are
@@ -216,7 +220,7 @@ impl Recording {
 
     /// An error about this file.
     pub fn broken(&self, problem: impl Into<String>) -> ReadError {
-        ReadError::Broken { path: self.path.clone(), problem: problem.into() }
+        ReadError::Broken { path: self.source.path.clone(), problem: problem.into() }
     }
 
     /// An error about a batch of packets that reached the server at `log_time`.
@@ -225,16 +229,16 @@ impl Recording {
     }
 }
 
-/// A file whose first message has not been looked at.
-struct Unchecked {
-    file: File,
+/// A file, and what its channels are.
+struct Source {
+    file: Box<dyn Bytes>,
     path: String,
     length: u64,
     /// By id; nothing for channels that are not ours.
     channels: HashMap<u16, Option<Topic>>,
 }
 
-impl Unchecked {
+impl Source {
     fn read(&mut self, chunk: &ChunkPlace) -> Result<Vec<Entry>, ReadError> {
         let broken = |problem: String| ReadError::Broken { path: self.path.clone(), problem };
         let end = chunk.offset.checked_add(chunk.length).filter(|end| *end <= self.length);
@@ -297,7 +301,7 @@ impl Unchecked {
 }
 
 /// The index at the end of a finished file.
-fn read_summary(file: &mut File, length: u64) -> Result<Option<mcap::Summary>, McapError> {
+fn read_summary(file: &mut dyn Bytes, length: u64) -> Result<Option<mcap::Summary>, McapError> {
     let options = SummaryReaderOptions::default().with_file_size(length).with_record_length_limit(MAX_RECORD);
     let mut reader = SummaryReader::new_with_options(options);
     while let Some(event) = reader.next_event() {
@@ -316,7 +320,7 @@ fn read_summary(file: &mut File, length: u64) -> Result<Option<mcap::Summary>, M
 }
 
 /// Finds the chunks of a file that has no index, by the heads of its records; and where the last whole record ends.
-pub(super) fn scan(file: &mut File, length: u64) -> io::Result<(Vec<ChunkPlace>, u64)> {
+pub(super) fn scan(file: &mut dyn Bytes, length: u64) -> io::Result<(Vec<ChunkPlace>, u64)> {
     let (mut at, mut chunks) = (MAGIC.len() as u64, Vec::new());
     let mut head = [0; RECORD_HEAD as usize];
     while at + RECORD_HEAD <= length && chunks.len() < MAX_CHUNKS {

@@ -2,20 +2,17 @@
 
 use super::format::{SessionEvent, VERSION};
 use super::writer::{RecordError, RecordingWriter};
+use crate::send::{SendError, connect};
 use futures_util::StreamExt;
 use mcap::McapError;
 use rhytid_shared::packet::PacketLayout;
 use rhytid_shared::trust::Trust;
-use rhytid_shared::view::{SUBPROTOCOL, ViewMessage};
+use rhytid_shared::view::ViewMessage;
 use std::fs::{File, OpenOptions};
 use std::future::Future;
 use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-use tokio_tungstenite::tungstenite::http::{HeaderValue, header};
-use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
-use tokio_tungstenite::tungstenite::{self, Message};
-use tokio_tungstenite::{Connector, connect_async_tls_with_config};
+use tokio_tungstenite::tungstenite::Message;
 
 /// Largest message: the hello of 64 bones and 8 poses takes about 60 KB.
 const MAX_MESSAGE: usize = 1 << 20;
@@ -45,28 +42,34 @@ pub enum WatchError {
     },
 }
 
-/// Records `room` of `server` (e.g. `ws://127.0.0.1:7878`; `wss://` where `trust` says so) into a new file at `out` until `stop` is done or the server closes; gives the
-/// number of packets and of bytes.
-pub async fn watch(server: &str, room: &str, trust: &Trust, out: &Path, stop: impl Future<Output = ()>) -> Result<(u64, u64), WatchError> {
+/// Records `room` of `server` (e.g. `ws://127.0.0.1:7878`; `wss://` where `trust` says so; with `token` where it wants one) into a
+/// new file at `out` until `stop` is done or the server closes; gives the number of packets and of bytes.
+pub async fn watch(
+    server: &str,
+    room: &str,
+    trust: &Trust,
+    token: Option<&str>,
+    out: &Path,
+    stop: impl Future<Output = ()>,
+) -> Result<(u64, u64), WatchError> {
     let url = format!("{}/v1/rooms/{room}/view", server.trim_end_matches('/'));
     let failed = |problem: String| WatchError::Server { url: url.clone(), problem };
-    let connecting = async {
-        let mut request = url.as_str().into_client_request()?;
-        request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
-        let config = WebSocketConfig::default().max_message_size(Some(MAX_MESSAGE)).max_frame_size(Some(MAX_MESSAGE));
-        let tls = trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
-        let (mut socket, _) = connect_async_tls_with_config(request, Some(config), true, Some(Connector::Rustls(tls))).await?;
+    let mut socket = connect(url.clone(), trust, token, PATIENCE, MAX_MESSAGE).await.map_err(|error| match error {
+        SendError::Connect { problem, .. } => failed(problem),
+        other => failed(other.to_string()),
+    })?;
+    let greeting = async {
         loop {
             match socket.next().await {
-                Some(Ok(Message::Text(text))) => return Ok((socket, text)),
+                Some(Ok(Message::Text(text))) => return Ok(text),
                 Some(Ok(_)) => {}
-                Some(Err(error)) => return Err(error),
-                None => return Err(tungstenite::Error::ConnectionClosed),
+                Some(Err(error)) => return Err(error.to_string()),
+                None => return Err("it closed before its hello".into()),
             }
         }
     };
-    let (mut socket, text) = match tokio::time::timeout(PATIENCE, connecting).await {
-        Ok(connected) => connected.map_err(|error| failed(error.to_string()))?,
+    let text = match tokio::time::timeout(PATIENCE, greeting).await {
+        Ok(text) => text.map_err(failed)?,
         Err(_) => return Err(failed(format!("no hello within {} s", PATIENCE.as_secs()))),
     };
     let hello = match serde_json::from_str(&text) {

@@ -1,13 +1,13 @@
 //! One entry for each parser, as fuzzers want it: any bytes in, and a panic where the parser lets through what it must not.
 
-use super::{Refusal, Seen, Sight, fmv3, ifacialmocap, livelink, livelink_csv, openseeface, sniff, vmc, vts};
+use super::{Refusal, Seen, Sight, fmv3, ifacialmocap, livelink, livelink_csv, openseeface, openseeface_csv, sniff, vmc, vts};
 use std::io::Read;
 
 /// A parser's entry, and what its corpus is called.
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub const TARGETS: [Target; 8] = [
+pub const TARGETS: [Target; 9] = [
     ("openseeface", openseeface_target),
     ("livelink", livelink_target),
     ("ifacialmocap", ifacialmocap_target),
@@ -15,6 +15,7 @@ pub const TARGETS: [Target; 8] = [
     ("vmc", vmc_target),
     ("vts", vts_target),
     ("livelink_csv", livelink_csv_target),
+    ("openseeface_csv", openseeface_csv_target),
     ("sniff", sniff_target),
 ];
 
@@ -70,8 +71,17 @@ pub fn vts_target(bytes: &[u8]) {
 
 /// Recordings of Live Link Face. What comes out is a feed.
 pub fn livelink_csv_target(bytes: &[u8]) {
+    feed_of(livelink_csv::LiveLinkCsv::new(bytes));
+}
+
+/// OpenSeeFace's logs: what is taken is a feed that every server takes.
+pub fn openseeface_csv_target(bytes: &[u8]) {
+    feed_of(openseeface_csv::OpenSeeFaceCsv::new(bytes));
+}
+
+fn feed_of(mut lines: impl Read) {
     let mut text = String::new();
-    if livelink_csv::LiveLinkCsv::new(bytes).read_to_string(&mut text).is_err() {
+    if lines.read_to_string(&mut text).is_err() {
         return;
     }
     let mut feed = crate::feed::Feed::new_for_any_character(text.as_bytes(), "recording".into()).expect("a recording gives a feed");
