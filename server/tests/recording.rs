@@ -534,6 +534,7 @@ fn a_full_disk_ends_the_recording_and_not_the_stream() {
     drop(served);
     let mut files: Vec<PathBuf> = std::fs::read_dir(&folder.0).unwrap().map(|entry| entry.unwrap().path()).collect();
     files.sort();
+    assert!(files.iter().all(|file| std::fs::metadata(file).unwrap().len() > 0), "{files:?}");
     let report = recover(&files[0], None).unwrap();
     assert!(report.packets > 20, "{report:?}");
 }

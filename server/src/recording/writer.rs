@@ -8,6 +8,7 @@
 //! stopped machine what came since the last `fdatasync`, every [`SYNC`].
 
 use super::format::{Entry, PROFILE, SessionEvent, Topic, VERSION};
+use super::reader::{ReadError, Recording};
 use crate::metrics::Metrics;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
@@ -206,6 +207,7 @@ impl Recorder {
             clock,
         };
         let (layout, most_bytes, metrics, room) = (self.layout.clone(), self.config.file_bytes, self.metrics.clone(), room.clone());
+        let folder = dir.clone();
         let open = move |shared: &Shared| {
             let (file, path) = create(&dir, &room)?;
             *lock(&shared.file) = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -232,6 +234,11 @@ impl Recorder {
             match &ended {
                 Ok(()) => tracing::info!(file, "recording ended"),
                 Err(error) => {
+                    // On a full disk every publisher would leave an empty file.
+                    let path = folder.join(&file);
+                    if !file.is_empty() && matches!(Recording::open(&path), Err(ReadError::Broken { .. })) {
+                        let _ = std::fs::remove_file(&path);
+                    }
                     metrics.recording_failures.inc();
                     tracing::error!(file, error, "recording failed; the stream goes on");
                 }
