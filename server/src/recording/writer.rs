@@ -741,7 +741,7 @@ mod tests {
         assert_eq!((metrics.recording_failures.get(), metrics.recordings.get()), (1, 0));
         let path = dir.join(&status.file);
         assert_eq!(metrics.recording_bytes.get(), std::fs::metadata(&path).unwrap().len());
-        let mut recording = super::super::Recording::open(&path).unwrap();
+        let mut recording = Recording::open(&path).unwrap();
         assert_eq!(recording.cut_off(), None, "it is finished all the same");
         let mut text = String::new();
         for index in 0..recording.chunks().len() {
