@@ -32,6 +32,7 @@ mod view;
 mod zones;
 
 pub use camera::Camera;
+use coefficients::active_poses;
 pub use coefficients::{bone_major, moves_bone, pose_table};
 pub use deformation::{Deformation, DeformationError};
 pub use device::{optional_features, required_limits};
@@ -368,12 +369,14 @@ impl Renderer {
         // Wrinkles narrower than a few pixels would only glitter.
         let fade = settings.camera.wrinkle_fade(FURROW_WAVELENGTH, size[1]) * f32::from(u8::from(settings.wrinkles));
         coefficients.iter_mut().flatten().for_each(|coefficient| *coefficient *= fade);
+        let mut weights: uniforms::WrinkleWeights = bytemuck::Zeroable::zeroed();
         if let Some(scales) = &self.zone_scales {
             let fade = settings.camera.wrinkle_fade(scales.wavelength, size[1]) * f32::from(u8::from(settings.wrinkles));
-            let weights = scales.weights(frame, settings.zone_blend, fade);
+            weights = scales.weights(frame, settings.zone_blend, fade);
             self.is_stretched = weights.stretched != [[0.0; 4]; 2];
-            queue.write_buffer(&self.group.zone_weights, 0, bytemuck::bytes_of(&weights));
         }
+        weights.active_poses = active_poses(&frame.influences, num_bones);
+        queue.write_buffer(&self.group.wrinkle_weights, 0, bytemuck::bytes_of(&weights));
         if let Some(blood) = &mut self.blood
             && blood.mix(frame)
         {

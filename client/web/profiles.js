@@ -1,5 +1,6 @@
 // Profiles of performers, as files and as the server keeps them.
 
+import { headers } from "./access.js";
 import { saveFile } from "./util.js";
 
 /** A file larger than this is no profile, bytes: what the server takes, too. */

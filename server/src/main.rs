@@ -14,7 +14,7 @@ use rhytid_server::{
     StepAt, Timeouts, Tls, VmcOutSpec, bind, fake, fit_feed, fit_live, load_character, run, send, write_profile,
 };
 use rhytid_shared::trust::Trust;
-use rhytid_shared::{Character, FIT_SECONDS, FitStep, Profile, ProfileChoice, RoomName, Settings};
+use rhytid_shared::{Character, FIT_SECONDS, FitStep, Profile, ProfileChoice, RoomName, Settings, Slot};
 use std::io::{IsTerminal, Write};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -129,6 +129,12 @@ struct SendArgs {
     /// Take the room over from another publisher.
     #[arg(long)]
     takeover: bool,
+    /// Slot in the room, beside other sources, in place of what the feed's hello says.
+    #[arg(long, value_name = "NAME", value_parser = parse_name)]
+    slot: Option<RoomName>,
+    /// Priority of that slot: the highest live one drives the face.
+    #[arg(long, value_name = "0..100", value_parser = clap::value_parser!(u8).range(..=i64::from(Slot::MAX_PRIORITY)))]
+    priority: Option<u8>,
     /// Send frames of landmarks in the binary form, a twelfth of the bytes.
     #[arg(long)]
     binary: bool,
@@ -435,6 +441,8 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         speed: args.speed,
         repeats: args.repeats,
         takeover: args.takeover,
+        slot: args.slot,
+        priority: args.priority,
         binary: args.binary,
         profile: args.profile,
         timeout: args.timeout,

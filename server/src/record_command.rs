@@ -162,6 +162,8 @@ pub(crate) async fn replay_file(args: ReplayArgs) -> anyhow::Result<()> {
             speed,
             repeats,
             takeover,
+            slot: None,
+            priority: None,
             binary: false,
             profile: None,
             timeout,

@@ -8,7 +8,7 @@ use futures_util::{SinkExt, StreamExt};
 use indicatif::ProgressBar;
 use rhytid_shared::trust::Trust;
 use rhytid_shared::view::SUBPROTOCOL;
-use rhytid_shared::{ProfileChoice, TrackingData, TrackingFrame, encode_landmarks};
+use rhytid_shared::{ProfileChoice, RoomName, TrackingData, TrackingFrame, encode_landmarks};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -89,6 +89,10 @@ pub struct SendOptions {
     pub repeats: bool,
     /// Take the room over from another publisher.
     pub takeover: bool,
+    /// Slot in the room, in place of what the feed's hello says.
+    pub slot: Option<RoomName>,
+    /// Priority of that slot, 0 to 100, in place of what the feed's hello says.
+    pub priority: Option<u8>,
     /// Send frames of landmarks in the binary form, a twelfth of the bytes; what it has no room for stays JSON.
     pub binary: bool,
     /// What is known of the performer, in place of what the feed's hello says.
@@ -438,14 +442,20 @@ async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sen
     End { is_normal: false, reason: last_error.unwrap_or_else(|| "the connection broke off".into()), errors }
 }
 
-/// The feed's hello, with `takeover` and the profile where they are wanted.
+/// The feed's hello, with what the options add to it.
 fn hello(line: &str, options: &SendOptions) -> String {
-    if !options.takeover && options.profile.is_none() {
+    if !options.takeover && options.profile.is_none() && options.slot.is_none() && options.priority.is_none() {
         return line.to_owned();
     }
     let Ok(mut fields) = serde_json::from_str::<serde_json::Map<String, serde_json::Value>>(line) else { return line.to_owned() };
     if options.takeover {
         fields.insert("takeover".into(), true.into());
+    }
+    if let Some(slot) = &options.slot {
+        fields.insert("slot".into(), slot.as_str().into());
+    }
+    if let Some(priority) = options.priority {
+        fields.insert("priority".into(), priority.into());
     }
     match &options.profile {
         Some(ProfileChoice::Given(profile)) => {

@@ -575,6 +575,8 @@ fn a_recording_of_live_link_face_is_a_feed() {
         speed: 2.0,
         repeats: false,
         takeover: false,
+        slot: None,
+        priority: None,
         binary: false,
         profile: None,
         timeout: Duration::from_secs(10),

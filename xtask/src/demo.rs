@@ -3,7 +3,7 @@
 use crate::{setup, web, workspace_root};
 use anyhow::{Context, Result, ensure};
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::TcpStream;
+use std::net::{TcpStream, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
@@ -16,6 +16,8 @@ const GRACE: Duration = Duration::from_secs(30);
 const VIEWER_TIMEOUT: Duration = Duration::from_secs(60);
 /// How long the server may take to load the character and listen.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
+/// Where OpenSeeFace sends by itself; whatever tracker sends there drives the demo's room.
+const TRACKERS: &str = "127.0.0.1:11573";
 
 /// Sets up, builds, serves, publishes and shows. Returns when the window is closed, the film is finished or Ctrl-C is pressed.
 pub fn run() -> Result<()> {
@@ -39,16 +41,26 @@ pub fn run() -> Result<()> {
     ensure!(status.success(), "the build failed ({status})");
 
     let bin = target_dir(&root).join("release");
-    let mut server = Running::start(
-        "rhytid-server",
-        Command::new(bin.join("rhytid-server")).args(["serve", "--listen", "127.0.0.1:0"]).stdout(Stdio::piped()),
-    )?;
+    let mut serve = Command::new(bin.join("rhytid-server"));
+    serve.args(["serve", "--listen", "127.0.0.1:0"]).stdout(Stdio::piped());
+    // Another server on this machine may have the port.
+    let takes_trackers = UdpSocket::bind(TRACKERS).is_ok();
+    if takes_trackers {
+        serve.args(["--listen-udp", &format!("any={TRACKERS},room=demo")]);
+    }
+    let mut server = Running::start("rhytid-server", &mut serve)?;
     let url = server.listening_url()?.replacen("http://", "ws://", 1);
     println!("demo: serving at {url}, room demo; in a browser: {}/?room=demo", url.replacen("ws://", "http://", 1));
+    if takes_trackers {
+        println!(
+            "demo: trackers' datagrams drive the face, too, at {TRACKERS} (to try: target/release/rhytid-server fake shared/assets/demo.ibug68.jsonl --as openseeface --to {TRACKERS} --loop)"
+        );
+    }
 
     let feed = root.join("shared/assets/demo.ibug68.jsonl");
+    // Whoever publishes from a browser or a tracker has the face while they do.
     let mut sender = Command::new(bin.join("rhytid-server"));
-    sender.arg("send").arg(&feed).args(["--to", &url, "--room", "demo"]);
+    sender.arg("send").arg(&feed).args(["--to", &url, "--room", "demo", "--slot", "session", "--priority", "10"]);
     let mut viewer = Command::new(bin.join("rhytid-client"));
     let has_display = setup::has_display();
     if has_display {

@@ -23,6 +23,12 @@ pub fn bone_major(pose_major: &[f32], num_bones: usize, num_poses: usize) -> Vec
     vectors
 }
 
+/// One bit for each pose that shows anywhere, of influences pose-major.
+pub fn active_poses(pose_major: &[f32], num_bones: usize) -> u32 {
+    let is_active = |influences: &[f32]| influences.iter().any(|influence| *influence > 0.0);
+    pose_major.chunks(num_bones.max(1)).enumerate().map(|(k, influences)| u32::from(is_active(influences)) << k).sum()
+}
+
 /// The table that stays on the device.
 pub fn pose_table(asset: &CharacterAsset) -> PoseTable {
     let character = &asset.character;

@@ -53,7 +53,7 @@ impl Layouts {
                 binding(7, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
                 binding(8, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2Array)),
                 binding(9, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),
-                uniform(10, Stages::FRAGMENT, size_of::<uniforms::ZoneWeights>()),
+                uniform(10, Stages::FRAGMENT, size_of::<uniforms::WrinkleWeights>()),
                 binding(11, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2)),
             ],
         );

@@ -139,16 +139,20 @@ impl MorphWeights {
     }
 }
 
-/// Zone weights, four a vec4 as in the masks.
+/// What of the wrinkles shows in a frame: zone weights, four a vec4 as in the masks, and which poses do.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub struct ZoneWeights {
+pub struct WrinkleWeights {
     /// How strongly each zone's wrinkles show, times the map's largest slope.
     pub wrinkled: [[f32; 4]; 2],
     /// How far each zone is stretched, times the largest slope of that map.
     pub stretched: [[f32; 4]; 2],
+    /// One bit for each pose that shows anywhere.
+    pub active_poses: u32,
+    /// Fills the block up.
+    pub padding: [u32; 3],
 }
-assert_layout!(ZoneWeights, zone_weights, { wrinkled: WRINKLED, stretched: STRETCHED });
+assert_layout!(WrinkleWeights, wrinkle_weights, { wrinkled: WRINKLED, stretched: STRETCHED, active_poses: ACTIVE_POSES });
 
 /// Group 2.
 #[repr(C)]

@@ -53,7 +53,7 @@ pub struct CharacterGroup {
     pub palette: wgpu::Buffer,
     pub coefficients: wgpu::Buffer,
     pub morph_weights: wgpu::Buffer,
-    pub zone_weights: wgpu::Buffer,
+    pub wrinkle_weights: wgpu::Buffer,
     /// Change of haemoglobin.
     pub blood: wgpu::Texture,
     /// Bytes of the zones' masks and of their wrinkle map.
@@ -202,7 +202,7 @@ impl<'a> Uploader<'a> {
         let sampler = self.map_sampler("wrinkle sampler");
         let morph_deltas = self.morph_deltas(&asset.morphs);
         let morph_weights = self.uniform("morph weights", size_of::<uniforms::MorphWeights>());
-        let zone_weights = self.uniform("zone weights", size_of::<uniforms::ZoneWeights>());
+        let wrinkle_weights = self.uniform("wrinkle weights", size_of::<uniforms::WrinkleWeights>());
         let (no_mask, no_difference) =
             (MipChain::uniform([1, 1], Texels::Linear4, &[0; 4]), MipChain::uniform([1, 1], Texels::Linear4, &[128; 4]));
         let before = self.bytes;
@@ -238,11 +238,11 @@ impl<'a> Uploader<'a> {
                 entry(7, wgpu::BindingResource::TextureView(&masks)),
                 entry(8, wgpu::BindingResource::TextureView(&zone_maps)),
                 entry(9, wgpu::BindingResource::TextureView(&difference)),
-                entry(10, zone_weights.as_entire_binding()),
+                entry(10, wrinkle_weights.as_entire_binding()),
                 entry(11, wgpu::BindingResource::TextureView(&blood.create_view(&wgpu::TextureViewDescriptor::default()))),
             ],
         });
-        CharacterGroup { palette, coefficients, morph_weights, zone_weights, blood, zone_bytes, group }
+        CharacterGroup { palette, coefficients, morph_weights, wrinkle_weights, blood, zone_bytes, group }
     }
 
     /// The map of blood, `side` texels a side, as it is at rest.

@@ -1,7 +1,7 @@
 //! Zone weights as the shaders take them.
 
 use super::RenderFrame;
-use super::uniforms::ZoneWeights;
+use super::uniforms::WrinkleWeights;
 use super::view::ZoneBlend;
 use crate::asset::ZoneMaps;
 
@@ -30,8 +30,8 @@ impl ZoneScales {
         blend != ZoneBlend::Difference || self.has_difference
     }
 
-    /// A frame's weights, four a vec4, the maps' scales and `fade` multiplied in.
-    pub fn weights(&self, frame: &RenderFrame, blend: ZoneBlend, fade: f32) -> ZoneWeights {
+    /// A frame's zone weights, four a vec4, the maps' scales and `fade` multiplied in.
+    pub fn weights(&self, frame: &RenderFrame, blend: ZoneBlend, fade: f32) -> WrinkleWeights {
         let packed = |weights: &[f32], factor: f32| {
             let mut vectors = [[0.0; 4]; 2];
             for (to, weight) in vectors.iter_mut().flatten().zip(weights) {
@@ -40,6 +40,10 @@ impl ZoneScales {
             vectors
         };
         let scale = if blend == ZoneBlend::Difference { 1.0 } else { self.wrinkled };
-        ZoneWeights { wrinkled: packed(&frame.zones, scale * fade), stretched: packed(&frame.stretched, self.stretched * fade) }
+        WrinkleWeights {
+            wrinkled: packed(&frame.zones, scale * fade),
+            stretched: packed(&frame.stretched, self.stretched * fade),
+            ..bytemuck::Zeroable::zeroed()
+        }
     }
 }

@@ -22,12 +22,14 @@ override POSES: u32 = 255u;
 @group(1) @binding(3) var wrinkle_maps: texture_2d_array<f32>;
 @group(1) @binding(4) var wrinkle_sampler: sampler;
 
-// Zone i is component i % 4 of vec4 i / 4, as in the masks.
-struct ZoneWeights {
+// What shows in this frame. Zone i is component i % 4 of vec4 i / 4, as in the masks.
+struct WrinkleWeights {
     // How strongly each zone's wrinkles show, times the map's largest slope (difference maps: as it is).
     wrinkled: array<vec4<f32>, 2>,
     // How far each zone is stretched, times the largest slope of that map.
     stretched: array<vec4<f32>, 2>,
+    // One bit for each pose that shows anywhere.
+    active_poses: u32,
 }
 
 @group(1) @binding(7) var zone_masks: texture_2d_array<f32>;
@@ -35,7 +37,7 @@ struct ZoneWeights {
 @group(1) @binding(8) var zone_maps: texture_2d_array<f32>;
 // Wrinkled less neutral unit normal.
 @group(1) @binding(9) var zone_difference: texture_2d<f32>;
-@group(1) @binding(10) var<uniform> zone_weights: ZoneWeights;
+@group(1) @binding(10) var<uniform> wrinkle_weights: WrinkleWeights;
 
 // Change of haemoglobin since rest: code 128 is none, the others reach frame.blood.x.
 @group(1) @binding(11) var blood_map: texture_2d<f32>;
@@ -113,9 +115,10 @@ fn signed_code(texel: vec4<f32>) -> vec4<f32> {
     return texel * (255.0 / 127.0) - 128.0 / 127.0;
 }
 
-// Shares of the eight zones at a place.
+// Shares of the eight zones at a place. Masks are coarse and soft: their smaller versions are never wanted, nor the time it takes
+// to choose among them.
 fn masks_of(uv: vec2<f32>) -> array<vec4<f32>, 2> {
-    return array<vec4<f32>, 2>(textureSample(zone_masks, wrinkle_sampler, uv, 0), textureSample(zone_masks, wrinkle_sampler, uv, 1));
+    return array<vec4<f32>, 2>(textureSampleLevel(zone_masks, wrinkle_sampler, uv, 0, 0.0), textureSampleLevel(zone_masks, wrinkle_sampler, uv, 1, 0.0));
 }
 
 fn zone_amount(masks: array<vec4<f32>, 2>, weights: array<vec4<f32>, 2>) -> f32 {
@@ -124,9 +127,9 @@ fn zone_amount(masks: array<vec4<f32>, 2>, weights: array<vec4<f32>, 2>) -> f32 
 
 fn zone_slope(uv: vec2<f32>) -> vec2<f32> {
     let masks = masks_of(uv);
-    var slope = signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 0)).xy * zone_amount(masks, zone_weights.wrinkled);
+    var slope = signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 0)).xy * zone_amount(masks, wrinkle_weights.wrinkled);
     if ZONES_STRETCH == 1u {
-        slope += signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 1)).xy * zone_amount(masks, zone_weights.stretched);
+        slope += signed_code(textureSample(zone_maps, wrinkle_sampler, uv, 1)).xy * zone_amount(masks, wrinkle_weights.stretched);
     }
     return slope;
 }
@@ -134,7 +137,8 @@ fn zone_slope(uv: vec2<f32>) -> vec2<f32> {
 fn wrinkled_normal(in: Varyings) -> vec3<f32> {
     var blend = begin_blend(base_slope(in.uv));
     for (var pose = 0u; pose < NUM_POSES; pose += 1u) {
-        if ((POSES >> pose) & 1u) == 0u {
+        // The same all over the picture: a device skips what it need not read.
+        if ((POSES & wrinkle_weights.active_poses) & (1u << pose)) == 0u {
             continue;
         }
         let map = slope_of(textureSample(wrinkle_maps, wrinkle_sampler, in.uv, pose).xy, pose_table.scales[pose / 4u][pose % 4u]);
@@ -146,7 +150,7 @@ fn wrinkled_normal(in: Varyings) -> vec3<f32> {
     }
     var normal = end_blend(blend);
     if ZONES == 2u {
-        let difference = signed_code(textureSample(zone_difference, wrinkle_sampler, in.uv)).xyz * zone_amount(masks_of(in.uv), zone_weights.wrinkled);
+        let difference = signed_code(textureSample(zone_difference, wrinkle_sampler, in.uv)).xyz * zone_amount(masks_of(in.uv), wrinkle_weights.wrinkled);
         normal = with_zones(normal, vec2<f32>(0.0), difference);
     } else if ZONES != 0u {
         normal = with_zones(normal, zone_slope(in.uv), vec3<f32>(0.0));

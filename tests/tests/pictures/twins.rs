@@ -293,6 +293,8 @@ const MAP_SIDE: usize = 16;
 const BASE_SCALE: f32 = 0.55;
 /// Poses that wrinkle what is drawn: some of either vec4, not all.
 const MASK: u8 = 0b1101_0110;
+/// A pose that reaches it as well but does not show in the frame.
+const IDLE: u8 = 0b0000_0001;
 
 /// Eight maps of noise, each with a scale of its own, and the neutral one under them, read at the middles of texels.
 fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
@@ -335,10 +337,11 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
     };
     use wgpu::TextureViewDimension::{D2, D2Array};
     let (base_view, layers_view) = (view(std::slice::from_ref(&base_map), D2), view(&layers, D2Array));
+    let weights = uniforms::WrinkleWeights { active_poses: u32::from(!IDLE), ..bytemuck::Zeroable::zeroed() };
     let probe = Probe {
         source: &format!("{}{PLACE}{FRAGMENT_PROBE}", rhytid_shaders::SURFACE),
         entries: ["vs_probe", "fs_probe"],
-        constants: &[("NUM_POSES", MAX_POSES as f64), ("BLEND", number_of(mode)? as f64), ("POSES", f64::from(MASK))],
+        constants: &[("NUM_POSES", MAX_POSES as f64), ("BLEND", number_of(mode)? as f64), ("POSES", f64::from(MASK | IDLE))],
         groups: &[
             (
                 1,
@@ -350,7 +353,7 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
                     (7, Resource::Texture { view: &layers_view, dimension: D2Array, is_filterable: true }),
                     (8, Resource::Texture { view: &layers_view, dimension: D2Array, is_filterable: true }),
                     (9, Resource::Texture { view: &base_view, dimension: D2, is_filterable: true }),
-                    (10, Resource::Block(&[0; size_of::<uniforms::ZoneWeights>()])),
+                    (10, Resource::Block(bytemuck::bytes_of(&weights))),
                 ],
             ),
             (

@@ -51,9 +51,10 @@ fn blended(stage: &Stage, blend: ZoneBlend) -> anyhow::Result<()> {
     let stretched: Vec<f32> = (0..8).map(|z| 0.9 - 0.1 * z as f32).collect();
     let packed =
         |weights: &[f32], factor: f32| -> [[f32; 4]; 2] { std::array::from_fn(|v| std::array::from_fn(|c| weights[4 * v + c] * factor)) };
-    let block = uniforms::ZoneWeights {
+    let block = uniforms::WrinkleWeights {
         wrinkled: packed(&wrinkled, if blend == ZoneBlend::Difference { 1.0 } else { scale }),
         stretched: packed(&stretched, stretch_scale),
+        ..bytemuck::Zeroable::zeroed()
     };
     let cases: Vec<[f32; 2]> = (0..SIDE * SIDE).map(|i| [i % SIDE, i / SIDE].map(|at| (at as f32 + 0.5) / SIDE as f32)).collect();
     let headless = stage.headless()?;

@@ -285,6 +285,8 @@ fn somebody_else_fits_a_source_at_the_command_line_and_the_profile_is_sent_along
         speed: 1.0,
         repeats: false,
         takeover: true,
+        slot: None,
+        priority: None,
         binary: false,
         profile: Some(ProfileChoice::Given(Box::new(profile))),
         timeout: Duration::from_secs(10),

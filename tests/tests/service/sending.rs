@@ -2,6 +2,7 @@
 
 use super::harness::Server;
 use rhytid_server::{SendError, SendOptions, SendReport, SendSource, send};
+use rhytid_shared::RoomName;
 use rhytid_shared::trust::Trust;
 use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant};
@@ -24,6 +25,8 @@ fn options(server: &Server, text: String) -> SendOptions {
         speed: f64::INFINITY,
         repeats: false,
         takeover: false,
+        slot: None,
+        priority: None,
         binary: false,
         profile: None,
         timeout: Duration::from_secs(15),
@@ -71,6 +74,24 @@ fn a_feed_is_sent_whole_at_full_speed_and_in_time_at_a_given_one() {
     let took = start.elapsed();
     assert!((Duration::from_millis(740)..Duration::from_millis(2500)).contains(&took), "3 s at four times the speed took {took:?}");
     assert_eq!(server.room("demo").unwrap()["session"], 2);
+}
+
+#[test]
+fn a_feed_goes_to_a_slot_of_its_own_beside_who_has_the_room() {
+    let server = Server::start();
+    let _main = server.ready_publisher("demo");
+    let mut options = options(&server, feed(3, 0.01));
+    let error = send_now(&options).unwrap_err().to_string();
+    assert!(error.contains("publisher"), "{error}");
+    options = SendOptions { slot: Some(RoomName::new("side").unwrap()), priority: Some(10), ..options };
+    options.source = SendSource::Text(feed(40, 0.05), "test feed".into());
+    options.speed = 1.0;
+    let sending = std::thread::spawn(move || send_now(&options));
+    let lists_side = |room: &serde_json::Value| {
+        room["sources"].as_array().unwrap().iter().any(|source| source["slot"] == "side" && source["priority"] == 10)
+    };
+    server.wait_for_room("demo", |room| room.is_some_and(lists_side));
+    assert_eq!(sending.join().unwrap().unwrap(), SendReport { frames: 40, errors: 0 });
 }
 
 #[test]

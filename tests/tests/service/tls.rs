@@ -69,6 +69,8 @@ fn viewers_and_senders_trust_a_fingerprint_or_an_authority_and_nothing_else() {
         speed: f64::INFINITY,
         repeats: false,
         takeover: false,
+        slot: None,
+        priority: None,
         binary: false,
         profile: None,
         timeout: Duration::from_secs(15),
