@@ -10,7 +10,7 @@ mod feed;
 mod lease;
 mod wire;
 
-use crate::room::{RoomListing, Rooms};
+use crate::room::{Others, RoomListing, Rooms};
 use crate::service::stopped;
 use async_nats::connection::State;
 use async_nats::jetstream::kv;
@@ -185,9 +185,9 @@ impl Cluster {
         }))
     }
 
-    /// Where rooms send their packets.
-    pub fn outlet(&self) -> Outlet {
-        self.outlet.clone()
+    /// What rooms need of other nodes.
+    pub fn others(&self) -> Others {
+        Others { outlet: self.outlet.clone(), interest: self.interest.clone() }
     }
 
     /// This node's id.
@@ -212,8 +212,8 @@ impl Cluster {
         rooms.collect()
     }
 
-    /// Viewers have come or gone.
-    pub fn interest_changed(&self) {
+    /// Whose rooms are whose has changed.
+    fn interest_changed(&self) {
         self.interest.send_replace(());
     }
 

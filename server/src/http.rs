@@ -3,7 +3,7 @@
 use crate::config::Access;
 use crate::service::{Hub, Peer};
 use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
-use crate::{control, page, publish, viewer};
+use crate::{control, page, publish, room, viewer};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{Path, Request, State};
@@ -20,7 +20,7 @@ use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 pub(crate) fn router(hub: Arc<Hub>) -> Router {
     Router::new()
         .route("/", get(start_page))
-        .route("/healthz", get(async || "ok\n"))
+        .route("/healthz", get(health))
         .route("/metrics", get(metrics))
         .route("/api/rooms", get(rooms))
         .route("/api/trackers", get(trackers))
@@ -122,8 +122,20 @@ async fn metrics(State(hub): State<Arc<Hub>>, headers: HeaderMap) -> Response {
     ([(header::CONTENT_TYPE, kind)], text).into_response()
 }
 
+/// `ok`, or what this node lacks of its cluster: its own rooms go on, so it is healthy all the same.
+async fn health(State(hub): State<Arc<Hub>>) -> String {
+    match hub.cluster.as_ref().and_then(|cluster| cluster.problem()) {
+        Some(problem) => format!("degraded: {problem}\n"),
+        None => "ok\n".to_owned(),
+    }
+}
+
+/// This node's rooms and, where there are others, theirs; each once, as its home tells of it.
 async fn rooms(State(hub): State<Arc<Hub>>) -> Response {
-    axum::Json(serde_json::json!({ "rooms": hub.rooms.list() })).into_response()
+    let own = hub.rooms.list();
+    let Some(cluster) = &hub.cluster else { return axum::Json(serde_json::json!({ "rooms": own })).into_response() };
+    let rooms = room::merge(cluster.node(), own, cluster.elsewhere());
+    axum::Json(serde_json::json!({ "node": cluster.node(), "rooms": rooms })).into_response()
 }
 
 async fn trackers(State(hub): State<Arc<Hub>>) -> Response {

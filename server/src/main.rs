@@ -4,8 +4,8 @@ use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use rhytid_server::{
-    Access, Clip, FakeKind, FakeOptions, Guide, Identity, Limits, ListenSpec, LiveFit, SendOptions, SendReport, SendSource, ServerConfig,
-    StepAt, Timeouts, Tls, VmcOutSpec, bind, fake, fit_feed, fit_live, load_character, run, send, write_profile,
+    Access, Clip, ClusterConfig, FakeKind, FakeOptions, Guide, Identity, Limits, ListenSpec, LiveFit, SendOptions, SendReport, SendSource,
+    ServerConfig, StepAt, Timeouts, Tls, VmcOutSpec, bind, fake, fit_feed, fit_live, load_character, run, send, write_profile,
 };
 use rhytid_shared::trust::Trust;
 use rhytid_shared::{FIT_SECONDS, FitStep, Profile, ProfileChoice, RoomName, Settings};
@@ -66,6 +66,8 @@ struct ServeArgs {
     /// that was made with it.
     #[arg(long, value_name = "DIR")]
     profiles: Option<PathBuf>,
+    #[command(flatten)]
+    cluster: ClusterConfig,
     #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
@@ -285,6 +287,10 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     }
     config.character = args.character.or(config.character);
     config.profiles = args.profiles.or(config.profiles);
+    // Given by flags it is whole, whatever the file says.
+    if args.cluster != ClusterConfig::default() {
+        config.cluster = args.cluster;
+    }
     config.listen_udp.extend(args.listen_udp);
     config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);

@@ -51,6 +51,17 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infa
             Err(_) => return Err(refusal("hello_timeout", format!("no hello within {} seconds", timeouts.hello))),
         },
     };
+    if let Some(cluster) = &hub.cluster {
+        cluster
+            .enter(&hub.rooms, room, &hello.slot.name, hello.takeover)
+            .await
+            .map_err(|error| refusal(error.code(), error.to_string()))?;
+        if hello.keep_neutral
+            && let Some(kept) = cluster.kept(room, &hello.slot.name).await
+        {
+            hub.rooms.restore(room, &hello.slot.name, kept);
+        }
+    }
     let (source, evicted) = Source::open(hub, room, hello).map_err(not_opened)?;
     let heard = Heard::now();
     let mut session = Session::new(hub, source, reader);

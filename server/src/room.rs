@@ -1,13 +1,13 @@
 //! Rooms: where one publisher's packets meet any number of viewers. A room holds one state, the newest; nothing queues.
 
+use crate::cluster::{Kept, Outlet, StateHead};
 use crate::metrics::Metrics;
-use crate::solve::Calibration;
 use crate::solve::mix::Mixer;
 use crate::source::Control;
 use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
-use rhytid_shared::{ChannelGroup, Character, FaceFrame, PublishHello, RoomName, Slot};
-use serde::Serialize;
+use rhytid_shared::{ChannelGroups, Character, FaceFrame, PublishHello, RoomName, Slot};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
@@ -102,6 +102,16 @@ pub(crate) struct Rooms {
     max_rooms: usize,
     max_viewers: usize,
     metrics: Arc<Metrics>,
+    /// Other nodes.
+    others: Option<Others>,
+}
+
+/// What rooms need of other nodes.
+pub(crate) struct Others {
+    /// Where packets leave for them.
+    pub outlet: Outlet,
+    /// Told when a room's viewers come or go.
+    pub interest: watch::Sender<()>,
 }
 
 /// One room.
@@ -113,6 +123,8 @@ pub(crate) struct Room {
     since: Instant,
     layout: PacketLayout,
     metrics: Arc<Metrics>,
+    outlet: Option<Outlet>,
+    interest: Option<watch::Sender<()>>,
 }
 
 struct RoomState {
@@ -133,14 +145,28 @@ struct RoomState {
     /// By slot, at most [`MAX_SLOTS`].
     neutrals: BTreeMap<String, Neutral>,
     empty_since: Instant,
+    /// Epoch under which packets leave for other nodes.
+    epoch: u64,
+    /// The newest state that came from another node, and the key packet that its deltas need.
+    fed: Option<StateHead>,
+    fed_key: Option<(u64, u64)>,
+}
+
+/// What became of another node's packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Fed {
+    /// It is the room's newest state.
+    Taken,
+    /// It is no newer than what has been shown, or this node is the home.
+    Old,
+    /// It needs a key packet that did not come.
+    NeedsKey,
 }
 
 /// The neutral face that a session came to: kept so that a publisher which comes back need not be searched again.
 struct Neutral {
     session: u32,
-    /// Whose it is.
-    hello: PublishHello,
-    calibration: Calibration,
+    kept: Kept,
 }
 
 struct Publisher {
@@ -152,7 +178,7 @@ struct Publisher {
 }
 
 /// A room as `/api/rooms` lists it.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RoomListing {
     name: String,
     viewers: usize,
@@ -166,33 +192,33 @@ pub(crate) struct RoomListing {
     neutral: Option<NeutralListing>,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct PublisherListing {
     source: String,
     seconds: f64,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct SourceListing {
     slot: String,
     source: String,
     priority: u8,
-    groups: Vec<&'static str>,
+    groups: Vec<String>,
     /// It has shown a face in the last half second.
     live: bool,
     /// The groups it drives now.
-    drives: Vec<&'static str>,
+    drives: Vec<String>,
     seconds: f64,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct FrameListing {
     seq: u32,
     t: f64,
     face: bool,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct NeutralListing {
     /// The session that came to it, and the time on its sender's clock, seconds.
     session: u32,
@@ -203,14 +229,18 @@ struct NeutralListing {
     requested: bool,
 }
 
+fn names_of(groups: ChannelGroups) -> Vec<String> {
+    groups.iter().map(|group| group.name().to_owned()).collect()
+}
+
 /// A lock that a panicking holder left is still whole: every change under it is complete at each step.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 impl Rooms {
-    pub fn new(character: Arc<Character>, max_rooms: usize, max_viewers: usize, metrics: Arc<Metrics>) -> Self {
-        Self { character, by_name: Mutex::default(), max_rooms, max_viewers, metrics }
+    pub fn new(character: Arc<Character>, max_rooms: usize, max_viewers: usize, metrics: Arc<Metrics>, others: Option<Others>) -> Self {
+        Self { character, by_name: Mutex::default(), max_rooms, max_viewers, metrics, others }
     }
 
     /// Enters a room as a viewer; the room is made where there is none.
@@ -224,6 +254,9 @@ impl Rooms {
         state.num_viewers += 1;
         drop(state);
         self.metrics.viewers.inc();
+        if let Some(interest) = &room.interest {
+            interest.send_replace(());
+        }
         Ok(Viewing { slot: room.slot.subscribe(), room })
     }
 
@@ -285,9 +318,14 @@ impl Rooms {
                 shown: None,
                 neutrals: BTreeMap::new(),
                 empty_since: Instant::now(),
+                epoch: 0,
+                fed: None,
+                fed_key: None,
             }),
             layout,
             metrics: self.metrics.clone(),
+            outlet: self.others.as_ref().map(|others| others.outlet.clone()),
+            interest: self.others.as_ref().map(|others| others.interest.clone()),
         });
         by_name.insert(name.clone(), room.clone());
         self.metrics.rooms.set(by_name.len() as i64);
@@ -299,11 +337,70 @@ impl Rooms {
         lock(&self.by_name).get(name).cloned()
     }
 
-    /// The neutral face that the room keeps, for the slot of `hello`, of its tracker.
-    pub fn neutral(&self, name: &RoomName, hello: &PublishHello) -> Option<Calibration> {
+    /// What the room keeps for the slot of `hello`, of its tracker.
+    pub fn kept(&self, name: &RoomName, hello: &PublishHello) -> Option<Kept> {
         let room = self.find(name)?;
         let state = lock(&room.state);
-        state.neutrals.get(&hello.slot.name).filter(|kept| kept.hello.is_of_same_tracker(hello)).map(|kept| kept.calibration.clone())
+        state.neutrals.get(&hello.slot.name).filter(|neutral| neutral.kept.tracker == hello.tracker()).map(|neutral| neutral.kept.clone())
+    }
+
+    /// Takes over what other nodes keep of a room's slot, unless something is kept here.
+    pub fn restore(&self, name: &RoomName, slot: &str, kept: Kept) {
+        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
+        let mut state = lock(&room.state);
+        if state.neutrals.len() < MAX_SLOTS {
+            state.neutrals.entry(slot.to_owned()).or_insert(Neutral { session: 0, kept });
+        }
+    }
+
+    /// Slots of a room that are taken.
+    pub fn slots(&self, name: &RoomName) -> Vec<String> {
+        let Some(room) = self.find(name) else { return Vec::new() };
+        lock(&room.state).publishers.iter().map(|publisher| publisher.claim.slot.name.clone()).collect()
+    }
+
+    /// Sessions that a room has had.
+    pub fn num_sessions(&self, name: &RoomName) -> u32 {
+        self.find(name).map_or(0, |room| lock(&room.state).num_sessions)
+    }
+
+    /// A room's newest state as messages for another node: the key packet, and the delta where there is one.
+    pub fn newest(&self, name: &RoomName) -> Vec<Bytes> {
+        let Some(room) = self.find(name) else { return Vec::new() };
+        let state = lock(&room.state);
+        let Some(latest) = room.slot.borrow().clone() else { return Vec::new() };
+        let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
+        let key = head(latest.key.index).message(&latest.key.bytes);
+        latest.delta.iter().fold(vec![key], |mut messages, delta| {
+            messages.push(head(latest.index).message(delta));
+            messages
+        })
+    }
+
+    /// This node is a room's home from now on, under `epoch`; others may have had `sessions` sessions of it.
+    pub fn lead(&self, name: &RoomName, epoch: u64, sessions: u32) {
+        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
+        let mut state = lock(&room.state);
+        state.epoch = epoch;
+        state.num_sessions = state.num_sessions.max(sessions);
+    }
+
+    /// Sends a room's publishers away: another node is its home.
+    pub fn evict(&self, name: &RoomName) {
+        let Some(room) = self.find(name) else { return };
+        let mut state = lock(&room.state);
+        for publisher in std::mem::take(&mut state.publishers) {
+            state.mixer.leave(publisher.session);
+            self.metrics.publishers.dec();
+            // Its task may have ended in this moment.
+            let _ = publisher.evict.send(());
+        }
+        state.empty_since = Instant::now();
+    }
+
+    /// Rooms that somebody watches here.
+    pub fn watched(&self) -> Vec<Arc<Room>> {
+        lock(&self.by_name).values().filter(|room| lock(&room.state).num_viewers > 0).cloned().collect()
     }
 
     /// Removes rooms that have been without publisher and viewers for `idle`.
@@ -327,6 +424,30 @@ impl Room {
     /// Seconds on the mixer's clock.
     fn now(&self) -> f64 {
         self.since.elapsed().as_secs_f64()
+    }
+
+    /// Takes a packet that came from the room's home at another node.
+    pub fn feed(&self, head: StateHead, packet: Bytes) -> Fed {
+        let mut guard = lock(&self.state);
+        let state = &mut *guard;
+        if !state.publishers.is_empty() || state.epoch > head.epoch || state.fed.is_some_and(|fed| head <= fed) {
+            return Fed::Old;
+        }
+        let key = (head.epoch, head.key_index);
+        let delta = if head.index == head.key_index {
+            state.key = Some(Arc::new(KeyPacket { index: state.num_states + 1, bytes: packet }));
+            state.fed_key = Some(key);
+            None
+        } else if state.fed_key == Some(key) {
+            Some(packet)
+        } else {
+            return Fed::NeedsKey;
+        };
+        let Some(key) = state.key.clone() else { return Fed::NeedsKey };
+        state.fed = Some(head);
+        state.num_states += 1;
+        self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key, delta, json: OnceLock::new() })));
+        Fed::Taken
     }
 
     /// Where commands to the source in this slot go.
@@ -357,15 +478,15 @@ impl Room {
                         slot: claim.slot.name.clone(),
                         source: claim.source.clone(),
                         priority: claim.slot.priority,
-                        groups: claim.slot.groups.iter().map(ChannelGroup::name).collect(),
+                        groups: names_of(claim.slot.groups),
                         live,
-                        drives: drives.iter().map(ChannelGroup::name).collect(),
+                        drives: names_of(drives),
                         seconds: since.elapsed().as_secs_f64(),
                     }
                 })
                 .collect(),
             frame: state.shown.map(|(seq, micros, face)| FrameListing { seq, t: micros as f64 / 1e6, face }),
-            neutral: newest_neutral.map(|Neutral { session, calibration, .. }| NeutralListing {
+            neutral: newest_neutral.map(|Neutral { session, kept: Kept { calibration, .. } }| NeutralListing {
                 session: *session,
                 t: calibration.t,
                 num_frames: calibration.num_frames,
@@ -388,6 +509,9 @@ impl Drop for Viewing {
         state.num_viewers -= 1;
         state.empty_since = Instant::now();
         self.room.metrics.viewers.dec();
+        if let Some(interest) = &self.room.interest {
+            interest.send_replace(());
+        }
     }
 }
 
@@ -426,26 +550,32 @@ impl Publishing {
         };
         state.key = Some(key.clone());
         state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
+        if let Some(outlet) = &self.room.outlet {
+            let head = StateHead { epoch: state.epoch, index, key_index: key.index };
+            if !outlet.send(&self.room.name, head, &state.packet) {
+                self.room.metrics.drop_frames("slow_cluster", 1);
+            }
+        }
         // Under the lock, so that states stand in the slot in their order.
         self.room.slot.send_replace(Some(Arc::new(Latest { index, key, delta, json: OnceLock::new() })));
         true
     }
 
-    /// Makes `calibration` the neutral face that the room keeps for the slot of `hello`, unless a later session has left one or it
-    /// is kept already.
-    pub fn keep_neutral(&self, hello: &PublishHello, calibration: &Calibration) {
+    /// Makes `kept` what the room keeps for `slot`, unless a later session has left something or it is kept already; true where it
+    /// is new.
+    pub fn keep(&self, slot: &str, kept: Kept) -> bool {
         let mut state = lock(&self.room.state);
         let neutrals = &mut state.neutrals;
-        let slot = &hello.slot.name;
-        let kept = neutrals.get(slot);
-        if kept.is_none() && neutrals.len() >= MAX_SLOTS {
+        let before = neutrals.get(slot);
+        if before.is_none() && neutrals.len() >= MAX_SLOTS {
             // Slots come and go under any names: the oldest neutral makes room.
             let oldest = neutrals.iter().min_by_key(|(_, neutral)| neutral.session).map(|(slot, _)| slot.clone());
             oldest.map(|oldest| neutrals.remove(&oldest));
-        } else if kept.is_some_and(|kept| kept.session > self.session || kept.calibration == *calibration) {
-            return;
+        } else if before.is_some_and(|before| before.session > self.session || before.kept == kept) {
+            return false;
         }
-        neutrals.insert(slot.clone(), Neutral { session: self.session, hello: hello.clone(), calibration: calibration.clone() });
+        neutrals.insert(slot.to_owned(), Neutral { session: self.session, kept });
+        true
     }
 }
 
@@ -461,13 +591,45 @@ impl Drop for Publishing {
     }
 }
 
+/// A room of the cluster as `/api/rooms` lists it.
+#[derive(Debug, Serialize)]
+pub(crate) struct ClusterListing {
+    #[serde(flatten)]
+    room: RoomListing,
+    /// Its home, or one where somebody watches.
+    node: String,
+    /// Viewers by node, where there are any.
+    nodes: BTreeMap<String, usize>,
+}
+
+/// All nodes' listings in one, by name: the room as its home tells of it, viewers summed up.
+pub(crate) fn merge(node: &str, own: Vec<RoomListing>, elsewhere: Vec<(String, RoomListing)>) -> Vec<ClusterListing> {
+    let mut by_name: BTreeMap<String, ClusterListing> = BTreeMap::new();
+    for (node, room) in own.into_iter().map(|room| (node.to_owned(), room)).chain(elsewhere) {
+        let viewers = room.viewers;
+        let listed = by_name.entry(room.name.clone()).or_insert_with(|| ClusterListing {
+            room: room.clone(),
+            node: node.clone(),
+            nodes: BTreeMap::new(),
+        });
+        if listed.room.publisher.is_none() && room.publisher.is_some() {
+            (listed.room, listed.node) = (room, node.clone());
+        }
+        if viewers > 0 {
+            listed.nodes.insert(node, viewers);
+        }
+        listed.room.viewers = listed.nodes.values().sum();
+    }
+    by_name.into_values().collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn rooms(max_rooms: usize, max_viewers: usize) -> Rooms {
         let character = Arc::new(Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap());
-        Rooms::new(character, max_rooms, max_viewers, Arc::new(Metrics::new()))
+        Rooms::new(character, max_rooms, max_viewers, Arc::new(Metrics::new()), None)
     }
 
     /// Claims a slot that nobody commands.

@@ -1,5 +1,6 @@
 //! The service as a whole: connections in, tasks out, and an orderly end.
 
+use crate::cluster::{Cluster, ClusterError};
 use crate::config::{Limits, ServerConfig, ServerConfigError, seconds};
 use crate::http::router;
 use crate::metrics::Metrics;
@@ -62,6 +63,9 @@ pub enum ServerError {
         /// What is wrong with it.
         source: CharacterError,
     },
+    /// The cluster cannot be joined.
+    #[error(transparent)]
+    Cluster(#[from] ClusterError),
     /// The folder of profiles cannot be used.
     #[error(transparent)]
     Profiles(#[from] ProfileError),
@@ -91,7 +95,9 @@ pub(crate) struct Hub {
     pub character_url: String,
     pub hello_character: CharacterHello,
     pub layout: PacketLayout,
-    pub rooms: Rooms,
+    pub rooms: Arc<Rooms>,
+    /// This node among others.
+    pub cluster: Option<Arc<Cluster>>,
     pub trackers: Trackers,
     pub profiles: Arc<Profiles>,
     pub metrics: Arc<Metrics>,
@@ -149,13 +155,25 @@ pub async fn run(
     }
     let profiles = Profiles::load(config.profiles.as_deref())?;
     let metrics = Arc::new(Metrics::new());
+    let cluster = match &config.cluster.nats {
+        Some(url) => {
+            let scheme = if identity.is_some() { "wss" } else { "ws" };
+            let advertised = config.cluster.advertise.clone().unwrap_or_else(|| format!("{scheme}://{address}"));
+            Some(Cluster::join(&config.cluster, url, advertised, &character.sha256).await?)
+        }
+        None => None,
+    };
+    let others = cluster.as_ref().map(|cluster| cluster.others());
+    let limits = &config.limits;
+    let rooms = Arc::new(Rooms::new(character.clone(), limits.rooms, limits.viewers_per_room, metrics.clone(), others));
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
     let character_url = format!("/characters/{}.glb", file_name(&character.name));
     let hub = Arc::new(Hub {
         hello_character: ViewHello::new("", &character, character_url.clone()).character,
         layout: PacketLayout::from(&*character),
-        rooms: Rooms::new(character.clone(), config.limits.rooms, config.limits.viewers_per_room, metrics.clone()),
+        rooms: rooms.clone(),
+        cluster: cluster.clone(),
         trackers: Trackers::default(),
         profiles: Arc::new(profiles),
         listens_on_loopback: address.ip().is_loopback(),
@@ -176,6 +194,10 @@ pub async fn run(
         move || hub.upgrade().iter().for_each(|hub| crate::solve::prepare(&hub.character, &hub.config.solve))
     });
     tracing::info!(%address, character = hub.character.name, "serving");
+    if let Some(cluster) = &cluster {
+        cluster.start(Arc::downgrade(&rooms), &hub.shutdown);
+    }
+    drop(rooms);
     listen::start(&hub, ports);
     vmc_out::start(&hub, outs);
     tokio::pin!(shutdown);

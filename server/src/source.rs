@@ -2,6 +2,7 @@
 //! or somebody for it, asks for.
 
 use crate::answer::Answer;
+use crate::cluster::{Cluster, Kept};
 use crate::pipeline::Pipeline;
 use crate::profiles::Profiles;
 use crate::publish::Rate;
@@ -9,7 +10,9 @@ use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
 use crate::socket::ErrorMessage;
 use crate::solve::{Calibration, SolveError};
-use rhytid_shared::{Command, FitRequest, Profile, ProfileChoice, PublishHello, RoomName, Settings, TrackingFrame};
+use rhytid_shared::{
+    Command, FaceKind, FitRequest, PROFILE_VERSION, Profile, ProfileChoice, PublishHello, RoomName, Settings, TrackingFrame,
+};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
@@ -77,6 +80,7 @@ pub(crate) struct Source {
     hello: PublishHello,
     controls: mpsc::Receiver<Control>,
     profiles: Arc<Profiles>,
+    cluster: Option<Arc<Cluster>>,
     /// The profile in use.
     profile: Option<Profile>,
     /// Its settings have changed since it was kept.
@@ -92,18 +96,22 @@ pub(crate) struct Source {
 impl Source {
     /// Claims the slot that `hello` names. The second value is done when another publisher has taken it over.
     pub fn open(hub: &Hub, room: &RoomName, mut hello: PublishHello) -> Result<(Self, Evicted), OpenError> {
+        let kept = hello.keep_neutral.then(|| hub.rooms.kept(room, &hello)).flatten();
         let profile = match hello.profile.take() {
             Some(ProfileChoice::Given(profile)) => Some(*profile),
             Some(ProfileChoice::Named(name)) => match hub.profiles.named(&name) {
                 Some(profile) => Some((*profile).clone()),
                 None => return Err(UnknownProfile(name).into()),
             },
-            None => hub.profiles.of_source(&hello.source).map(|profile| (*profile).clone()),
+            // One who comes back finds everything as it was.
+            None => match kept.as_ref().and_then(|kept| kept.profile.clone()) {
+                Some(profile) => Some(profile),
+                None => hub.profiles.of_source(&hello.source).map(|profile| (*profile).clone()),
+            },
         };
         hello.profile = profile.clone().map(|profile| ProfileChoice::Given(Box::new(profile)));
         // Before the slot is claimed: a hello that leads to nothing takes no slot from anybody.
-        let kept = hello.keep_neutral.then(|| hub.rooms.neutral(room, &hello)).flatten();
-        let (mut pipeline, kept_neutral) = start(hub, &hello, kept)?;
+        let (mut pipeline, kept_neutral) = start(hub, &hello, kept.map(|kept| kept.calibration))?;
         let (controls, waiting) = mpsc::channel(MOST_CONTROLS);
         let (place, evicted) = hub.rooms.claim(room, SlotClaim::of(&hello), controls)?;
         pipeline.set_session(place.session);
@@ -117,6 +125,7 @@ impl Source {
             hello,
             controls: waiting,
             profiles: hub.profiles.clone(),
+            cluster: hub.cluster.clone(),
             profile,
             is_profile_changed: false,
             fit_owner: FitOwner::Publisher,
@@ -308,10 +317,25 @@ impl Source {
         let _ = answer.send(told);
     }
 
-    /// Leaves the neutral in use with the room.
-    fn keep_neutral(&self) {
-        if let Some(calibration) = self.pipeline.calibration() {
-            self.place.keep_neutral(&self.hello, calibration);
+    /// Leaves the neutral in use with the room, and with other nodes.
+    fn keep_neutral(&mut self) {
+        let Some(calibration) = self.pipeline.calibration().cloned() else { return };
+        let solver = self.pipeline.solver();
+        let (settings, ranges) = (*solver.settings(), *solver.ranges());
+        let measured = if calibration.points.is_empty() { FaceKind::Weights } else { FaceKind::Landmarks };
+        let profile = match &self.profile {
+            Some(profile) => Profile { neutral: None, ranges, settings, ..profile.clone() },
+            None => {
+                let (name, source) = (String::new(), self.hello.source.clone());
+                Profile { rhytid_profile: PROFILE_VERSION, name, source, measured, neutral: None, ranges, settings }
+            }
+        };
+        let kept = Kept { tracker: self.hello.tracker(), calibration, profile: Some(profile) };
+        let slot = &self.hello.slot.name;
+        if self.place.keep(slot, kept.clone())
+            && let Some(cluster) = &self.cluster
+        {
+            cluster.keep(self.room(), slot, &kept);
         }
     }
 

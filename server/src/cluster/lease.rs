@@ -73,8 +73,7 @@ impl Cluster {
                 // NATS has gone in this moment.
                 Err(_) => return Ok(self.hold(rooms, room, own(&before), None)),
             };
-            let found: Option<(u64, Lease)> =
-                entry.and_then(|entry| Some((entry.revision, serde_json::from_slice(&entry.value).ok()?)));
+            let found: Option<(u64, Lease)> = entry.and_then(|entry| Some((entry.revision, serde_json::from_slice(&entry.value).ok()?)));
             let Some((revision, lease)) = found else {
                 let lease = own(&before);
                 match buckets.leases.create(room.as_str(), text_of(&lease)).await {
@@ -151,9 +150,8 @@ impl Cluster {
             match buckets.leases.entry(room.as_str()).await {
                 Ok(Some(entry)) if entry.operation == Operation::Put => {
                     let Ok(other) = serde_json::from_slice::<Lease>(&entry.value) else { continue };
-                    let is_free = other.node.is_empty()
-                        || other.node == self.node
-                        || self.check_home(&room, &other, "", false).await.is_ok();
+                    let is_free =
+                        other.node.is_empty() || other.node == self.node || self.check_home(&room, &other, "", false).await.is_ok();
                     if is_free {
                         let lease = Lease { epoch: held.lease.epoch.max(other.epoch + 1), ..held.lease };
                         if let Ok(revision) = buckets.leases.update(room.as_str(), text_of(&lease), entry.revision).await {
@@ -186,8 +184,7 @@ impl Cluster {
         let Ok(mut changes) = buckets.leases.watch_with_history(">").await else { return };
         while let Some(Ok(entry)) = changes.next().await {
             let (Some(rooms), Ok(room)) = (rooms.upgrade(), RoomName::new(&entry.key)) else { continue };
-            let lease: Option<Lease> =
-                if entry.operation == Operation::Put { serde_json::from_slice(&entry.value).ok() } else { None };
+            let lease: Option<Lease> = if entry.operation == Operation::Put { serde_json::from_slice(&entry.value).ok() } else { None };
             let Some(lease) = lease else {
                 lock(&self.leases).remove(&room);
                 continue;
