@@ -20,6 +20,7 @@ pub mod gallery;
 pub mod link;
 #[cfg(not(target_arch = "wasm32"))]
 mod picture_size;
+mod rate;
 #[cfg(feature = "embedded")]
 pub mod render_cli;
 #[cfg(not(target_arch = "wasm32"))]

@@ -32,6 +32,8 @@ pub struct LinkOptions {
     pub room: RoomName,
     /// Whom to trust where the server is encrypted.
     pub trust: Trust,
+    /// What lets it in, where the server wants to know. Sent over TLS or to this machine only.
+    pub token: Option<String>,
     /// SHA-256 (lower-case hex) of the character that is there already and need not be fetched.
     pub known_sha256: Option<String>,
 }

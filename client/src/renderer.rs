@@ -13,6 +13,7 @@ mod fullscreen;
 #[cfg(not(target_arch = "wasm32"))]
 mod headless;
 mod layouts;
+mod map_pool;
 mod picture_texture;
 mod pipelines;
 mod present;
@@ -37,6 +38,7 @@ pub use device::{optional_features, required_limits};
 pub use frame::RenderFrame;
 #[cfg(not(target_arch = "wasm32"))]
 pub use headless::{AdapterChoice, Headless, RenderError};
+pub use map_pool::MapPool;
 #[cfg(not(target_arch = "wasm32"))]
 pub use picture_texture::picture_texture;
 pub use pipelines::VERTEX_LAYOUT;
@@ -47,13 +49,15 @@ pub use timing::{Pass, PassTimer};
 pub use view::{BlendError, BlendMode, NameError, Term, ViewError, ViewMode, WrinkleSystem, ZoneBlend};
 
 use crate::asset::{CharacterAsset, Palette, Surface};
-use anatomy::{Mouth, eyeballs, gazes};
+use anatomy::{Lids, Mouth, eyeballs, gazes};
 use blood::Blood;
 use glam::{Affine3A, Vec3};
 use layouts::Layouts;
+use map_pool::PooledMap;
 use pipelines::{Key, Look, Pipelines, Wire};
 use present::Presenter;
 use rhytid_shared::Character;
+use rhytid_shared::character::Side;
 use scattering::{Lens, Scattering};
 use shadow::Shadow;
 use std::sync::Arc;
@@ -171,7 +175,15 @@ pub struct Renderer {
     /// Draw calls of the last picture.
     num_draws: u32,
     static_bytes: u64,
+    /// What the bind groups read from: kept in the pool for as long as this character is drawn.
+    maps: Vec<Arc<PooledMap>>,
     target_format: wgpu::TextureFormat,
+}
+
+/// Maps of a character that is drawn no longer.
+#[derive(Debug)]
+pub struct KeptMaps {
+    _maps: Vec<Arc<PooledMap>>,
 }
 
 /// Metres from one furrow of the forehead to the next: where they cover less than a few pixels, wrinkles fade.
@@ -189,10 +201,17 @@ struct Bounds {
 
 impl Renderer {
     /// Uploads `asset` for pictures of `target_format` (any 8-bit RGBA or BGRA format,
-    /// with or without sRGB encoding). Pipelines are built as views first need them.
-    pub fn new(device: &wgpu::Device, queue: &wgpu::Queue, asset: &CharacterAsset, target_format: wgpu::TextureFormat) -> Self {
+    /// with or without sRGB encoding); maps that a character of the device's `pool` has are shared with it.
+    /// Pipelines are built as views first need them.
+    pub fn new(
+        device: &wgpu::Device,
+        queue: &wgpu::Queue,
+        pool: &MapPool,
+        asset: &CharacterAsset,
+        target_format: wgpu::TextureFormat,
+    ) -> Self {
         let layouts = Layouts::new(device);
-        let mut uploader = Uploader { device, queue, bytes: 0 };
+        let mut uploader = Uploader::new(device, queue, pool);
         let primitives: Vec<Primitive> = asset.primitives.iter().map(|primitive| uploader.primitive(&layouts, asset, primitive)).collect();
         let group = uploader.character(&layouts, asset);
         let frame_block = uploader.uniform("frame", size_of::<uniforms::Frame>());
@@ -226,6 +245,7 @@ impl Renderer {
             pipelines: Pipelines::new(&layouts, asset.character.num_poses()),
             background: background::pipeline(device),
             static_bytes: uploader.bytes + shadow.bytes,
+            maps: uploader.maps,
             shadow,
             environment,
             lit_by: None,
@@ -305,9 +325,19 @@ impl Renderer {
         self.num_draws
     }
 
-    /// Bytes of buffers and textures this renderer holds on the device.
+    /// Bytes of buffers and textures this renderer uses on the device, shared ones included.
     pub fn gpu_bytes(&self) -> u64 {
         self.static_bytes + self.targets.as_ref().map_or(0, |targets| targets.bytes)
+    }
+
+    /// Of those, bytes of maps that another character on the device uses as well.
+    pub fn shared_bytes(&self) -> u64 {
+        self.maps.iter().filter(|map| Arc::strong_count(map) > 1).map(|map| map.bytes).sum()
+    }
+
+    /// Drops all but the maps, which are kept until the value is dropped: for the next character, which may have the same.
+    pub fn into_maps(self) -> KeptMaps {
+        KeptMaps { _maps: self.maps }
     }
 
     fn write_uniforms(&mut self, queue: &wgpu::Queue, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) {
@@ -418,6 +448,7 @@ impl Renderer {
         )
         .inverse();
         let mouth = Mouth::new(character, frame);
+        let lids = [Side::Left, Side::Right].map(|side| Lids::new(character, frame, side));
         let shown = |k: usize| match settings.view {
             ViewMode::Influence(None) | ViewMode::Masks(None) => 1.0,
             ViewMode::Influence(Some(only)) | ViewMode::Masks(Some(only)) if only == k => 1.0,
@@ -437,6 +468,8 @@ impl Renderer {
             mouth: mouth.middle.extend(mouth.half_width).to_array(),
             mouth_shape: [mouth.light_reach(), mouth.corner_depth, 0.0, 0.0],
             eyeballs: eyeballs(character),
+            lid_corners: [lids[0].corners, lids[1].corners],
+            lid_arches: [lids[0].upper, lids[0].lower, lids[1].upper, lids[1].lower],
             gazes: gazes(character, frame),
             skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
             blood: [self.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],

@@ -21,10 +21,42 @@ pub struct WatchArgs {
     /// public ones
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     pub trust: Trust,
+    /// What lets it in, where the server wants one
+    #[command(flatten)]
+    pub token: TokenArgs,
+}
+
+/// How a viewer is given its token.
+#[derive(Debug, Clone, PartialEq, Eq, Default, clap::Args)]
+pub struct TokenArgs {
+    /// The token that lets it in, where the server wants one; else from the environment's RHYTID_TOKEN. Others on this machine can
+    /// read the arguments of a command: rather use a file
+    #[arg(long = "token", value_name = "TOKEN", conflicts_with = "from_file")]
+    pub given: Option<String>,
+    /// A file with the token
+    #[arg(long = "token-file", value_name = "FILE", value_parser = read_token)]
+    pub from_file: Option<String>,
+}
+
+impl TokenArgs {
+    fn token(self) -> Option<String> {
+        let token = self.from_file.or(self.given).or_else(|| std::env::var("RHYTID_TOKEN").ok());
+        token.map(|token| token.trim().to_owned()).filter(|token| !token.is_empty())
+    }
+}
+
+/// The token in a file, which is short and one word.
+fn read_token(path: &str) -> Result<String, String> {
+    let mut text = String::new();
+    let file = std::fs::File::open(path).map_err(|error| error.to_string())?;
+    std::io::Read::read_to_string(&mut std::io::Read::take(file, 4096), &mut text).map_err(|error| error.to_string())?;
+    let token = text.trim();
+    let is_word = !token.is_empty() && token.bytes().all(|byte| byte.is_ascii_graphic());
+    if is_word { Ok(token.to_owned()) } else { Err("it holds no token".into()) }
 }
 
 fn parse_trust(text: &str) -> Result<Trust, String> {
-    if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
+    Trust::from_argument(text, |path| std::fs::read(path))
 }
 
 /// Watches one room: takes what the link brings, keeps the playout, says what is the matter.
@@ -79,8 +111,10 @@ impl Spectator {
     /// Starts watching. `character` is the one that is there already; `wake` is called on the link's thread whenever
     /// something came.
     pub fn open(watch: WatchArgs, character: Arc<Character>, wake: impl Fn() + Send + 'static) -> Self {
-        let WatchArgs { server, room, trust } = watch;
-        let options = LinkOptions { server: server.clone(), room: room.clone(), trust, known_sha256: Some(character.sha256.clone()) };
+        let WatchArgs { server, room, trust, token } = watch;
+        let token = token.token();
+        let known_sha256 = Some(character.sha256.clone());
+        let options = LinkOptions { server: server.clone(), room: room.clone(), trust, token, known_sha256 };
         Self {
             link: Link::open(options, wake),
             playout: Playout::new(&character),

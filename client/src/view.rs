@@ -6,7 +6,6 @@ mod look;
 mod pages;
 mod painter;
 mod panel;
-mod rates;
 mod switches;
 mod window;
 
@@ -261,9 +260,10 @@ impl App {
         }
         let status = self.spectator.status(now);
         let link = self.spectator.link_stats();
-        self.rates.pictures.note(now, self.pictures);
-        self.rates.packets.note(now, link.packets);
-        self.rates.bytes.note(now, link.bytes);
+        let since_opened = now.saturating_duration_since(self.opened_at);
+        self.rates.pictures.note(since_opened, self.pictures as f64);
+        self.rates.packets.note(since_opened, link.packets as f64);
+        self.rates.bytes.note(since_opened, link.bytes as f64);
         self.live_since = if status.kind == StatusKind::Live || is_by_hand { self.live_since.or(Some(now)) } else { None };
 
         let adapter = gpu.adapter_name().to_owned();
@@ -276,6 +276,7 @@ impl App {
             link,
             playout: self.spectator.playout_stats(),
             rates: &self.rates,
+            since_opened,
             zone_bytes: gpu.zone_bytes(),
             adapter: &adapter,
             face: gpu.face_id(),

@@ -2,14 +2,13 @@
 //! comes over the socket goes in here, pictures come out. Everything between is what the window does, too.
 
 mod canvas;
-mod rate;
 mod state;
 
 use crate::asset::CharacterAsset;
 use crate::playout::{Playout, PlayoutState};
+use crate::rate::Rate;
 use crate::renderer::{BlendMode, Camera, Deformation, DrawSettings, RenderFrame, Studio, ViewMode, WrinkleSystem};
 use canvas::Canvas;
-use rate::Rate;
 use rhytid_shared::FaceFrame;
 use rhytid_shared::packet::{Decoder, PacketLayout};
 use rhytid_shared::view::{PROTOCOL_VERSION, ViewHello, ViewMessage};
@@ -18,8 +17,6 @@ use state::{Stats, frame_to_js};
 use std::time::Duration;
 use wasm_bindgen::prelude::*;
 
-/// Radians the camera turns for a drag over the height of the picture.
-const ORBIT_PER_HEIGHT: f32 = 3.5;
 /// Longest time that is believed of a page's clock, milliseconds (285 years).
 const MAX_MS: f64 = 9e12;
 
@@ -161,8 +158,8 @@ impl Viewer {
     /// Takes a packet. False where it makes no sense; nothing else is lost by that.
     pub fn packet(&mut self, bytes: &[u8], now_ms: f64) -> bool {
         self.now_ms = now_ms;
-        self.packets.add(now_ms, 1.0);
-        self.bytes.add(now_ms, bytes.len() as f64);
+        self.packets.add(moment(now_ms), 1.0);
+        self.bytes.add(moment(now_ms), bytes.len() as f64);
         let Some((decoder, frame)) = &mut self.decoder else { return false };
         if decoder.decode(bytes, frame).is_err() {
             self.num_garbage += 1;
@@ -203,14 +200,14 @@ impl Viewer {
         }
         scene.is_stale = false;
         self.draw_ms = js_sys::Date::now() - before;
-        self.pictures.add(now_ms, 1.0);
+        self.pictures.add(moment(now_ms), 1.0);
         Ok(true)
     }
 
     /// Turns the camera by a drag, device pixels.
     pub fn orbit(&mut self, dx: f32, dy: f32) {
-        let scale = ORBIT_PER_HEIGHT / self.canvas.height().max(1) as f32;
-        self.change(|settings| settings.camera.orbit(-dx * scale, dy * scale));
+        let height = self.canvas.height() as f32;
+        self.change(|settings| settings.camera.drag([dx, dy], height));
     }
 
     /// Brings the camera nearer (`factor` above 1) or farther.
@@ -292,9 +289,9 @@ impl Viewer {
         let stats = playout.map(|(_, stats)| stats).unwrap_or_default();
         Stats {
             state,
-            fps: self.pictures.per_second(now_ms),
-            packets: self.packets.per_second(now_ms),
-            bytes: self.bytes.per_second(now_ms),
+            fps: self.pictures.per_second(moment(now_ms)),
+            packets: self.packets.per_second(moment(now_ms)),
+            bytes: self.bytes.per_second(moment(now_ms)),
             face: self.newest.as_ref().is_some_and(|frame| frame.face),
             latency_ms: stats.delay.as_secs_f64() * 1e3,
             jitter_ms: stats.jitter.as_secs_f64() * 1e3,

@@ -6,6 +6,7 @@ import { Panel } from "./panel.js";
 import { Puppet } from "./puppet.js";
 import { RoomPicker } from "./rooms.js";
 import { listenForCopies, showLinks } from "./share.js";
+import { Sources } from "./sources.js";
 import { Stage, expressionNames, fetchCharacter } from "./stage.js";
 import { byId, element, roomOfAddress, storage, wallClock } from "./util.js";
 import { ViewLink } from "./view_link.js";
@@ -52,21 +53,25 @@ let room = roomOfAddress();
 /** The character of the last hello. @type {any} */
 let character = null;
 let problem = "";
+/** Why the face is not drawn for the moment. */
+let redrawing = "";
 let view = "beauty";
 let poseShown = -1;
 let wrinklesBefore = "own";
 let blend = 0;
 const times = new PacketTimes();
 
-const panel = new Panel(["camera", "puppet", "inspect", "share"], (name) => shownTab(name));
+const panel = new Panel(["camera", "puppet", "sources", "inspect", "share"], (name) => shownTab(name));
 const inspector = new Inspector(byId("page-inspect"));
 const puppet = new Puppet(byId("page-puppet"), (t, sent) => inspector.frameSent(t, sent, sent));
+const sources = new Sources(byId("page-sources"), room);
 const picker = new RoomPicker((name) => enter(name, true));
 
 function shownTab(/** @type {string | null} */ name) {
   // Called by the panel before what follows it is there.
   queueMicrotask(() => {
     inspector.setOpen(name === "inspect");
+    sources.setOpen(name === "sources");
     if (name === "camera") openCamera();
     if (name === "share") showLinks(room);
   });
@@ -112,6 +117,7 @@ function enter(name, isNew) {
   document.title = `${name} · Rhytid`;
   picker.current = name;
   puppet.enter(name);
+  sources.enter(name);
   tellCamera({ type: "room", room: name });
   if (!byId("page-share").hidden) showLinks(name);
   link?.close();
@@ -125,7 +131,9 @@ function openLink() {
     hello: (text) => greeted(text),
     packet: (bytes) => {
       const now = performance.now();
-      viewer?.packet(bytes, now);
+      if (viewer) viewer.packet(bytes, now);
+      // A delta needs the key before it and nothing between.
+      else early = (bytes[0] ?? 0) & 1 ? [...early.slice(0, 1), bytes] : [bytes];
       const read = times.read(bytes);
       if (read) inspector.packetArrived(read.micros, wallClock());
     },
@@ -138,19 +146,32 @@ function openLink() {
   });
 }
 
+/** Packets that came before there was a viewer: the last key and the newest one after it. @type {Uint8Array[]} */
+let early = [];
+/** The last hello, until there is a viewer to take it. */
+let earlyHello = "";
+
 /** The view socket's hello: on to its character. @param {string} text */
 async function greeted(text) {
-  if (!viewer) return;
+  const current = viewer;
+  if (!current) {
+    earlyHello = text;
+    early = [];
+    fetched(JSON.parse(text).character);
+    return;
+  }
   try {
     const hello = JSON.parse(text);
-    viewer.hello(text);
+    current.hello(text);
+    for (const bytes of early.splice(0)) current.packet(bytes, performance.now());
     const isOther = hello.character.sha256 !== character?.sha256;
     character = hello.character;
-    if (hello.character.sha256 !== viewer.loadedHash) {
-      const glb = await fetchCharacter(hello.character);
-      // Another hello may have come meanwhile.
-      if (character.sha256 !== hello.character.sha256) return;
-      viewer.load(glb, hello.character.sha256);
+    if (hello.character.sha256 !== current.loadedHash) {
+      const glb = await fetched(hello.character);
+      performance.mark("rhytid:fetched");
+      // Another hello may have come meanwhile, or another viewer.
+      if (character.sha256 !== hello.character.sha256 || current !== viewer) return;
+      current.load(glb, hello.character.sha256);
       puppet.setExpressions(expressionNames(glb));
     }
     if (isOther) {
@@ -158,7 +179,7 @@ async function greeted(text) {
       inspector.setCharacter(character);
       poseShown = -1;
     }
-    view = viewer.view;
+    view = current.view;
     showViews();
     markView();
     problem = "";
@@ -168,14 +189,66 @@ async function greeted(text) {
   showState();
 }
 
-/** The graphics device is gone: a fresh page gets another. Once a minute, or a broken driver would keep it reloading. */
-function drawingFailed(/** @type {unknown} */ error) {
-  problem = `${sentence(error).replace(/\.$/, "")}. Load the page again to try once more.`;
+/** A character that is being fetched, perhaps while the viewer is still being loaded. @type {{sha256: string, glb: Promise<Uint8Array>} | null} */
+let fetching = null;
+
+/** @param {{url: string, sha256: string}} wanted @returns {Promise<Uint8Array>} */
+function fetched(wanted) {
+  if (fetching?.sha256 !== wanted.sha256) {
+    const glb = fetchCharacter(wanted);
+    // Whoever awaits it hears of its failure; it is tried anew then.
+    glb.catch(() => { fetching = null; });
+    fetching = { sha256: wanted.sha256, glb };
+  }
+  const { glb } = fetching;
+  // Taken once: 6 MB are not kept for nothing.
+  if (viewer) fetching = null;
+  return glb;
+}
+
+/** Times at which the graphics device was lost lately, milliseconds. @type {number[]} */
+let losses = [];
+/** Losses within a minute after which a person must ask for more: a broken driver would be asked for ever. */
+const MOST_LOSSES = 4;
+
+/** The graphics device is gone: another is asked for, on a fresh canvas, since the old one stays with the old device. @param {unknown} error */
+function drawingFailed(error) {
+  const now = performance.now();
+  losses = [...losses.filter((at) => now - at < 60_000), now];
+  const words = sentence(error).replace(/\.$/, "");
+  if (losses.length > MOST_LOSSES) {
+    problem = `${words}. Load the page again to try once more.`;
+    showState();
+    return;
+  }
+  redrawing = `${words}. Drawing begins again.`;
   showState();
-  const last = Number(sessionStorage.getItem("rhytid.reloaded") ?? 0);
-  if (Date.now() - last < 60_000) return;
-  sessionStorage.setItem("rhytid.reloaded", String(Date.now()));
-  setTimeout(() => location.reload(), 1500);
+  // A driver that has just been reset needs a moment, each time a longer one.
+  setTimeout(drawAgain, 400 * 2 ** losses.length);
+}
+
+async function drawAgain() {
+  const old = byId("face");
+  const fresh = /** @type {HTMLCanvasElement} */ (old.cloneNode());
+  const hadFocus = document.activeElement === old;
+  old.replaceWith(fresh);
+  if (hadFocus) fresh.focus();
+  const before = viewer;
+  viewer = null;
+  before?.close();
+  link?.close();
+  try {
+    await openViewer(fresh, before);
+  } catch (error) {
+    drawingFailed(error);
+    return;
+  }
+  redrawing = "";
+  // Another room may have been entered meanwhile.
+  link?.close();
+  // The room says hello again: the face as it is, whole.
+  openLink();
+  showState();
 }
 
 /** Most characters of a complaint that are shown. */
@@ -199,6 +272,7 @@ const WORDS = {
   idle: ["idle", "Sender gone", "Waiting for somebody to publish to this room."],
   gone: ["bad", "Reconnecting", ""],
   refused: ["bad", "Refused", ""],
+  redrawing: ["warn", "Drawing again", ""],
   unusable: ["bad", "Cannot show the face", ""],
 };
 let shownState = "";
@@ -207,11 +281,12 @@ function showState() {
   let kind = "connecting";
   let detail = "";
   if (problem) [kind, detail] = ["unusable", problem];
+  else if (redrawing) [kind, detail] = ["redrawing", redrawing];
   else if (linkState === "refused") [kind, detail] = ["refused", linkDetail];
   else if (linkState === "lost" || (linkState === "connecting" && (link?.backoff.attempts ?? 0) > 0)) {
     [kind, detail] = ["gone", linkDetail || "The server does not answer"];
   } else if (linkState === "open") {
-    const state = viewer?.stats().state ?? "waiting";
+    const state = viewer ? viewer.stats().state : "connecting";
     kind = state in WORDS ? state : "waiting";
   }
   const [color, headline, text] = WORDS[/** @type {keyof typeof WORDS} */ (kind)];
@@ -385,6 +460,26 @@ function listen() {
   listenForCopies();
 }
 
+/**
+ * Draws on a canvas.
+ * @param {HTMLCanvasElement} canvas @param {FaceViewer | null} before the one whose view and switches it has
+ */
+async function openViewer(canvas, before) {
+  const started = await FaceViewer.start(canvas, { backend: parameters.get("backend") ?? "auto", transparent: isTransparent });
+  viewer = started;
+  byId("backend").textContent = `Drawn with ${started.backend()}.`;
+  document.documentElement.dataset.backend = started.backend();
+  for (const name of /** @type {("wrinkles" | "light" | "deform")[]} */ (Object.keys(CHOICES))) setSwitch(name, byId(name).value, false);
+  if (before) started.takeOver(before);
+  showViews();
+  new Stage(canvas, started, (now) => {
+    const frame = inspector.isOpen ? started.frame() : null;
+    if (!frame) return;
+    const { latencyMs, drawMs } = started.stats();
+    inspector.pictureShown(frame, latencyMs + drawMs, now);
+  }, drawingFailed);
+}
+
 async function start() {
   document.body.classList.add("viewer");
   document.body.classList.toggle("bare", isBare);
@@ -395,32 +490,23 @@ async function start() {
   document.title = `${room} · Rhytid`;
   picker.current = room;
   puppet.room = room;
-  const canvas = byId("face");
+  for (const name of /** @type {("wrinkles" | "light" | "deform")[]} */ (Object.keys(CHOICES))) {
+    const known = CHOICES[name].map(([value]) => value);
+    // What the address says is for this page alone.
+    byId(name).value = [parameters.get(name), storage.read(name)].find((value) => known.includes(value)) ?? known[0];
+  }
+  // Hello and character come while the viewer is loaded.
+  openLink();
   try {
-    viewer = await FaceViewer.start(canvas, { backend: parameters.get("backend") ?? "auto", transparent: isTransparent });
+    await openViewer(byId("face"), null);
   } catch (error) {
     problem = sentence(error);
     showState();
     return;
   }
-  const started = viewer;
-  byId("backend").textContent = `Drawn with ${started.backend()}.`;
-  document.documentElement.dataset.backend = started.backend();
-  for (const name of /** @type {("wrinkles" | "light" | "deform")[]} */ (Object.keys(CHOICES))) {
-    const asked = parameters.get(name);
-    // What the address says is for this page alone.
-    setSwitch(name, asked ?? storage.read(name) ?? CHOICES[name][0][0], !asked);
-  }
-  showViews();
-  new Stage(canvas, started, (now) => {
-    const frame = inspector.isOpen ? started.frame() : null;
-    if (!frame) return;
-    const { latencyMs, drawMs } = started.stats();
-    inspector.pictureShown(frame, latencyMs + drawMs, now);
-  }, drawingFailed);
   chooseView(parameters.get("view") ?? "beauty");
   setInterval(showNumbers, NUMBERS);
-  openLink();
+  if (earlyHello) greeted(earlyHello);
   if (!isBare && storage.read("panel") !== false && innerWidth > 1100) panel.toggle(true);
 }
 

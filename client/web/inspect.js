@@ -1,5 +1,6 @@
 // The inspector: what the packets say, over the last seconds, and what time each stage takes.
 
+import { headers } from "./access.js";
 import { History, LINES, SPAN, drawLines, heat, sharp } from "./plot.js";
 import { element } from "./util.js";
 
@@ -150,7 +151,8 @@ export class Inspector {
 
   async #askServer() {
     try {
-      const text = await (await fetch("/metrics")).text();
+      const answer = await fetch("/metrics", { headers: headers() });
+      const text = answer.ok ? await answer.text() : "";
       const number = (/** @type {string} */ name) => Number(new RegExp(`^\\w*${name}(?:\\{[^}]*\\})? ([0-9.e+-]+)`, "m").exec(text)?.[1] ?? NaN);
       const [sum, count] = [number("solve_seconds_sum"), number("solve_seconds_count")];
       if (count > this.lastServer.count) this.stages.solve = (1000 * (sum - this.lastServer.sum)) / (count - this.lastServer.count);

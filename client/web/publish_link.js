@@ -1,6 +1,8 @@
 // The socket that publishes: hello, frames, settings and questions. It comes back by itself, unless somebody else has the room.
 
-import { Backoff, SUBPROTOCOL, socketUrl } from "./util.js";
+import { askForToken, isAboutToken, onToken, protocols, refusal } from "./access.js";
+import { Questions } from "./questions.js";
+import { Backoff, socketUrl } from "./util.js";
 
 /**
  * @typedef {"off" | "connecting" | "ready" | "taken" | "refused" | "lost"} PublishState
@@ -34,14 +36,13 @@ export class PublishLink {
     /** @type {WebSocket | null} */
     this.socket = null;
     this.timer = 0;
-    /** The server takes binary frames, as far as is known. */
-    this.takesBinary = true;
     this.wasReadyAt = -Infinity;
     this.numFrames = 0;
     this.numSkipped = 0;
     this.bytes = 0;
-    /** @type {{matches: (message: any) => boolean, resolve: (message: any) => void, reject: (error: Error) => void, timer: number}[]} */
-    this.questions = [];
+    this.questions = new Questions();
+    /** Ends the waiting for another token. */
+    this.forgetToken = () => {};
   }
 
   /** @param {{takeover?: boolean}} [how] */
@@ -53,10 +54,11 @@ export class PublishLink {
 
   stop() {
     clearTimeout(this.timer);
+    this.forgetToken();
     const socket = this.socket;
     this.socket = null;
     socket?.close();
-    this.fail("publishing has been stopped");
+    this.questions.fail("publishing has been stopped");
     this.#become("off", "");
   }
 
@@ -64,10 +66,12 @@ export class PublishLink {
   connect(takeover) {
     clearTimeout(this.timer);
     this.#become("connecting", "");
-    const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/publish`), SUBPROTOCOL);
+    const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/publish`), protocols());
     this.socket = socket;
     let last = { code: "", message: "" };
+    let wasOpen = false;
     socket.onopen = () => {
+      wasOpen = true;
       const again = this.wasReadyAt > -Infinity;
       const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true } : {}) };
       socket.send(JSON.stringify(hello));
@@ -82,30 +86,26 @@ export class PublishLink {
       } catch {
         return;
       }
-      if (message.type === "error") {
-        last = message;
-        // A server that does not know binary frames says so at the first; JSON serves as well.
-        if (message.code === "binary_message") this.takesBinary = false;
-      }
+      if (message.type === "error") last = message;
       if (message.type === "ready") {
         this.backoff.reset();
         this.wasReadyAt = performance.now();
         this.#become("ready", "");
       }
-      const at = this.questions.findIndex((question) => question.matches(message));
-      if (at >= 0) {
-        const [question] = this.questions.splice(at, 1);
-        clearTimeout(question.timer);
-        if (message.type === "error") question.reject(Object.assign(new Error(message.message), { code: message.code }));
-        else question.resolve(message);
-      }
+      this.questions.heard(message);
       this.listener.message?.(message);
     };
-    socket.onclose = () => {
+    socket.onclose = async () => {
       clearTimeout(tooLate);
       if (this.socket !== socket) return;
+      if (!wasOpen) {
+        const refused = await refusal("publish", this.room);
+        // It may have been stopped meanwhile.
+        if (this.socket !== socket) return;
+        if (refused) last = refused;
+      }
       this.socket = null;
-      this.fail(last.message || "the connection was lost");
+      this.questions.fail(last.message || "the connection was lost");
       if (this.state === "ready") this.wasReadyAt = performance.now();
       this.#ended(last);
     };
@@ -119,6 +119,11 @@ export class PublishLink {
       this.#become("taken", message);
     } else if (code && !isTaken && !["shutdown", "idle", "too_many_rooms", "too_many_connections", "hello_timeout"].includes(code)) {
       this.#become("refused", message);
+      if (isAboutToken(code)) {
+        askForToken(message);
+        this.forgetToken();
+        this.forgetToken = onToken(() => this.start());
+      }
     } else {
       this.#become("lost", message || "The server does not answer");
       this.timer = setTimeout(() => this.connect(false), this.backoff.next());
@@ -164,26 +169,7 @@ export class PublishLink {
    * @returns {Promise<any>} rejects with an Error of one sentence; `code` is the server's where it refused
    */
   ask(message, matches, patience = 4000) {
-    return new Promise((resolve, reject) => {
-      if (!this.send(message)) {
-        reject(new Error("not connected to the room yet"));
-        return;
-      }
-      const question = { matches, resolve, reject, timer: 0 };
-      question.timer = window.setTimeout(() => {
-        this.questions = this.questions.filter((other) => other !== question);
-        reject(new Error("the server did not answer in time"));
-      }, patience);
-      this.questions.push(question);
-    });
-  }
-
-  /** @param {string} why */
-  fail(why) {
-    for (const question of this.questions.splice(0)) {
-      clearTimeout(question.timer);
-      question.reject(new Error(why));
-    }
+    return this.questions.ask(() => this.send(message), matches, patience);
   }
 
   /** @param {PublishState} state @param {string} detail */

@@ -1,5 +1,6 @@
 // The dialog that lists the server's rooms and goes to one.
 
+import { headers } from "./access.js";
 import { ROOM_NAME, byId, element } from "./util.js";
 
 /** Milliseconds between two looks at the list while it is open. */
@@ -48,7 +49,13 @@ export class RoomPicker {
     clearTimeout(this.timer);
     const list = byId("room-list");
     try {
-      const { rooms } = await (await fetch("/api/rooms")).json();
+      const answer = await fetch("/api/rooms", { headers: headers() });
+      if (answer.status === 401 || answer.status === 403) {
+        this.shown = "";
+        list.replaceChildren(element("li", { class: "quiet" }, "Only who may do everything sees the list of rooms. Enter the name of yours."));
+        return;
+      }
+      const { rooms } = await answer.json();
       // Only what changed is drawn anew: a list that is replaced takes the focus away.
       const text = JSON.stringify(rooms.map((/** @type {any} */ room) => [room.name, room.viewers, describe(room)]));
       if (text !== this.shown) {

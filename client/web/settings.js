@@ -1,4 +1,4 @@
-// How the server treats what this tracker sends: smoothing, gains, mirror. Changed while frames come.
+// How the server treats what a tracker sends: smoothing, gains, mirror. Changed while frames come.
 
 import { element, fillTrack, storage } from "./util.js";
 
@@ -13,13 +13,16 @@ export class Settings {
   /**
    * @param {HTMLElement} place
    * @param {(values: Record<string, any>) => void} changed called once a hand has paused
+   * @param {{key?: string, prefix?: string}} [how] key: where the browser keeps them, nowhere without; prefix: before the knobs' ids
    */
-  constructor(place, changed) {
+  constructor(place, changed, { key = "", prefix = "" } = {}) {
     this.place = place;
     this.changed = changed;
+    this.key = key;
+    this.prefix = prefix;
     this.timer = 0;
     /** @type {Record<string, any>} */
-    this.values = { mirror: false, gains: {}, smoothing: {}, ...storage.read("settings") };
+    this.values = { mirror: false, gains: {}, smoothing: {}, ...(key ? storage.read(key) : {}) };
     /** @type {Map<string, {input: HTMLInputElement, output: HTMLElement}>} */
     this.knobs = new Map();
     /** @type {Map<string, HTMLInputElement>} */
@@ -53,7 +56,7 @@ export class Settings {
 
   /** @param {"smoothing" | "gains"} kind @param {string} name @param {string} text @param {number} most */
   #knob(kind, name, text, most) {
-    const id = `knob-${kind}-${name}`;
+    const id = `${this.prefix}knob-${kind}-${name}`;
     const input = element("input", { type: "range", min: "0", max: String(most), step: "0.05", id });
     const output = element("output", { for: id });
     input.addEventListener("input", () => {
@@ -80,9 +83,12 @@ export class Settings {
 
   #tell() {
     this.show();
-    storage.write("settings", this.values);
+    this.#keep();
     clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.changed(this.toJson()), CALM);
+    this.timer = setTimeout(() => {
+      this.timer = 0;
+      this.changed(this.toJson());
+    }, CALM);
   }
 
   /** What the server answered. @param {Record<string, number> | undefined} delays seconds by group */
@@ -92,11 +98,21 @@ export class Settings {
     this.show();
   }
 
-  /** @param {Record<string, any>} values settings that came with a profile */
-  take(values) {
-    this.values = { ...this.values, ...values };
-    storage.write("settings", this.values);
+  #keep() {
+    if (this.key) storage.write(this.key, this.values);
+  }
+
+  /** @param {Record<string, any>} values settings that came with a profile, or are in use */
+  take({ mirror, swap_jaw, swap_mouth, gains, smoothing }) {
+    const given = { mirror, swap_jaw, swap_mouth, gains, smoothing };
+    this.values = { ...this.values, ...Object.fromEntries(Object.entries(given).filter(([, value]) => value !== undefined)) };
+    this.#keep();
     this.show();
+  }
+
+  /** A hand is at a knob, or the server has not been told yet. */
+  isBusy() {
+    return this.timer !== 0;
   }
 
   /** @param {string} text empty where all is well */

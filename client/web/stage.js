@@ -22,16 +22,22 @@ export class Stage {
     /** @type {Map<number, {x: number, y: number}>} */
     this.pointers = new Map();
     this.#fit();
-    new ResizeObserver(() => this.#fit()).observe(canvas);
+    const observer = new ResizeObserver(() => this.#fit());
+    observer.observe(canvas);
     this.#listen();
     let isOver = false;
     const end = (/** @type {unknown} */ error) => {
-      if (!isOver) failed(error);
+      if (isOver) return;
       isOver = true;
+      observer.disconnect();
+      failed(error);
     };
     canvas.addEventListener("webglcontextlost", () => end(new Error("The browser took the graphics device away.")));
     const tick = (/** @type {number} */ now) => {
       try {
+        const failure = isOver ? undefined : this.viewer.failure();
+        // Told even where nothing moves and so nothing is drawn.
+        if (failure) throw new Error(`The graphics device is gone: ${failure}`);
         if (!isOver && this.viewer.draw(now)) this.drawn(now);
       } catch (error) {
         end(error);

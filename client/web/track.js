@@ -3,11 +3,13 @@
 import { listCameras, openCamera } from "./camera.js";
 import { Clock } from "./clock.js";
 import { drawPoints, keyHeights } from "./overlay.js";
+import { readProfile, saveProfile } from "./profiles.js";
 import { PublishLink, publishSentence } from "./publish_link.js";
+import { answerOf } from "./questions.js";
 import { Settings } from "./settings.js";
 import { FaceTracker } from "./tracker.js";
-import { byId, roomOfAddress, saveFile, storage, wallClock } from "./util.js";
-import { encodePoints, pointsAsJson } from "./wire.js";
+import { byId, roomOfAddress, storage, wallClock } from "./util.js";
+import { encodePoints } from "./wire.js";
 import { Wizard } from "./wizard.js";
 
 const NUM_POINTS = 478;
@@ -15,8 +17,8 @@ const NUM_POINTS = 478;
 const NOBODY = 100;
 /** Milliseconds between two looks at the video while the page is out of sight. */
 const HIDDEN = 30;
-/** A profile file larger than this is none. */
-const MOST_PROFILE = 64 << 10;
+/** Milliseconds without a presented picture after which the page is taken to be out of sight: in a frame that is not shown it is not told. */
+const UNSEEN = 150;
 
 const isEmbedded = new URLSearchParams(location.search).get("embedded") === "1" && parent !== window;
 /** @type {HTMLVideoElement} */
@@ -48,16 +50,19 @@ let profile = storage.read("profile");
 let rate = { frames: 0, since: performance.now() };
 
 let link = newLink();
-const settings = new Settings(byId("settings-body"), (values) => tellSettings(values));
+const settings = new Settings(byId("settings-body"), (values) => tellSettings(values), { key: "settings" });
 const wizard = new Wizard({
   ask: (message, matches, patience) => link.ask(message, matches, patience),
-  done: (made) => keepProfile(made),
+  done: ({ profile: made, kept }) => {
+    keepProfile(made);
+    return kept ? `The profile is in use, kept in this browser, and by the server as “${made.name}”.` : "The profile is in use and kept in this browser.";
+  },
   apply: (offers) => {
     for (const [name, isOn] of Object.entries(offers)) settings.set(name, isOn);
   },
   save: (made) => saveProfile(made),
   opened: (isOpen) => tellParent({ type: "expand", isOn: isOpen }),
-});
+}, true);
 
 function newLink() {
   return new PublishLink(room, hello, { state: (state, detail) => publishState(state, detail), message: (message) => heard(message) });
@@ -198,13 +203,15 @@ async function loop(mine) {
  */
 function nextPicture() {
   return new Promise((resolve) => {
+    const asked = performance.now();
     const request = video.requestVideoFrameCallback((now, { captureTime }) => {
       tick = () => {};
+      lastVideoTime = video.currentTime;
       resolve(Math.min(now, captureTime ?? now));
     });
     // Out of sight no picture is presented, but the video goes on.
     tick = () => {
-      if (!document.hidden || video.currentTime === lastVideoTime) return;
+      if ((!document.hidden && performance.now() - asked < UNSEEN) || video.currentTime === lastVideoTime) return;
       // Where tracking is slow, the page's other work needs its share.
       if (performance.now() - tracked.at < 0.3 * tracked.took) return;
       tick = () => {};
@@ -236,7 +243,7 @@ function publish(isSeen, captured) {
     if (link.sendFrame({ type: "frame", t, face: false })) lastT = t;
     return;
   }
-  if (!link.sendFrame(link.takesBinary ? encodePoints(points, t) : pointsAsJson(points, t))) return;
+  if (!link.sendFrame(encodePoints(points, t))) return;
   lastT = t;
   tellParent({ type: "sent", t, captured: performance.timeOrigin + captured, sent: wallClock(), points: keyHeights(points) });
 }
@@ -297,17 +304,11 @@ function heard(message) {
 async function tellSettings(values) {
   if (link.state !== "ready") return;
   try {
-    await link.ask({ type: "settings", ...values }, (answer) => answer.type === "settings" || answer.type === "error");
+    await link.ask({ type: "settings", ...values }, answerOf("settings"));
     settings.say("");
   } catch (error) {
-    settings.say(refusal(error, "settings"));
+    settings.say(`The server did not take them: ${/** @type {Error} */ (error).message}.`);
   }
-}
-
-/** @param {unknown} error @param {string} what */
-function refusal(error, what) {
-  const { code, message } = /** @type {Error & {code?: string}} */ (error);
-  return code === "unknown_type" ? `This server does not take ${what}: it is an older one.` : `The server did not take them: ${message}`;
 }
 
 function calibrate() {
@@ -316,9 +317,9 @@ function calibrate() {
 
 async function recentre() {
   try {
-    await link.ask({ type: "recentre" }, (answer) => answer.type === "recentred" || answer.type === "error");
+    await link.ask({ type: "recentre" }, answerOf("recentred"));
   } catch (error) {
-    byId("answer").textContent = refusal(error, "re-centring");
+    byId("answer").textContent = `Not re-centred: ${/** @type {Error} */ (error).message}.`;
   }
 }
 
@@ -340,23 +341,14 @@ function showProfile() {
   byId("profile-forget").disabled = !profile;
 }
 
-/** @param {any} made */
-function saveProfile(made) {
-  saveFile("rhytid-profile.json", `${JSON.stringify(made, null, 2)}\n`);
-}
-
 /** @param {File} file */
 async function loadProfile(file) {
   try {
-    if (file.size > MOST_PROFILE) throw new Error("the file is too large to be a profile");
-    const loaded = JSON.parse(await file.text());
-    if (loaded?.rhytid_profile !== 1) throw new Error("the file is not a profile of version 1");
-    if (link.state === "ready") {
-      await link.ask({ type: "profile", profile: loaded }, (answer) => answer.type === "profile" || answer.type === "error");
-    }
+    const loaded = await readProfile(file);
+    if (link.state === "ready") await link.ask({ type: "profile", profile: loaded }, answerOf("profile"));
     keepProfile(loaded);
   } catch (error) {
-    byId("profile-text").textContent = `Not loaded: ${error instanceof SyntaxError ? "the file is not JSON" : /** @type {Error} */ (error).message}.`;
+    byId("profile-text").textContent = `Not loaded: ${/** @type {Error} */ (error).message}.`;
   }
 }
 

@@ -1,6 +1,7 @@
 // The socket that brings packets. It comes back by itself until it is closed.
 
-import { Backoff, SUBPROTOCOL, socketUrl } from "./util.js";
+import { askForToken, isAboutToken, onToken, protocols, refusal } from "./access.js";
+import { Backoff, socketUrl } from "./util.js";
 
 /**
  * @typedef {object} ViewListener
@@ -10,7 +11,7 @@ import { Backoff, SUBPROTOCOL, socketUrl } from "./util.js";
  */
 
 /** Codes of errors that another attempt does not cure. */
-const FINAL = new Set(["bad_room_name", "unknown_format", "forbidden_origin", "forbidden_host"]);
+const FINAL = new Set(["bad_room_name", "unknown_format", "forbidden_origin", "forbidden_host", "token_expired"]);
 
 /** Milliseconds within which a connection must bring its first message. */
 const PATIENCE = 10_000;
@@ -31,8 +32,12 @@ export class ViewLink {
     this.timer = 0;
     this.retryAt = 0;
     this.problem = "";
+    this.isRefused = false;
+    this.forgetToken = onToken(() => {
+      if (this.isRefused) this.connect();
+    });
     this.hurry = () => {
-      if (!document.hidden && !this.socket && !this.isClosed) this.connect();
+      if (!document.hidden && !this.socket && !this.isClosed && !this.isRefused) this.connect();
     };
     addEventListener("online", this.hurry);
     document.addEventListener("visibilitychange", this.hurry);
@@ -42,10 +47,12 @@ export class ViewLink {
   connect() {
     clearTimeout(this.timer);
     this.problem = "";
+    this.isRefused = false;
     let isFinal = false;
+    let code = "";
     let hasHello = false;
     this.listener.state("connecting", "");
-    const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/view`), SUBPROTOCOL);
+    const socket = new WebSocket(socketUrl(`/v1/rooms/${this.room}/view`), protocols());
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     const tooLate = setTimeout(() => socket.close(), PATIENCE);
@@ -58,7 +65,8 @@ export class ViewLink {
       const message = parsed(data);
       if (message?.type === "error") {
         this.problem = message.message;
-        isFinal = FINAL.has(message.code);
+        code = message.code;
+        isFinal = FINAL.has(code);
       } else if (!hasHello && message?.type === "hello") {
         hasHello = true;
         this.backoff.reset();
@@ -66,12 +74,22 @@ export class ViewLink {
         this.listener.state("open", "");
       }
     };
-    socket.onclose = () => {
+    let wasOpen = false;
+    socket.onopen = () => (wasOpen = true);
+    socket.onclose = async () => {
       clearTimeout(tooLate);
       if (this.socket !== socket || this.isClosed) return;
+      if (!wasOpen) {
+        const refused = await refusal("view", this.room);
+        // The link may have been closed meanwhile.
+        if (this.socket !== socket || this.isClosed) return;
+        if (refused) [this.problem, code, isFinal] = [refused.message, refused.code, true];
+      }
       this.socket = null;
       if (isFinal) {
+        this.isRefused = isAboutToken(code);
         this.listener.state("refused", this.problem);
+        if (this.isRefused) askForToken(this.problem);
         return;
       }
       const wait = this.backoff.next();
@@ -84,6 +102,7 @@ export class ViewLink {
   /** Ends it for good. */
   close() {
     this.isClosed = true;
+    this.forgetToken();
     clearTimeout(this.timer);
     removeEventListener("online", this.hurry);
     document.removeEventListener("visibilitychange", this.hurry);

@@ -21,6 +21,7 @@ export class FaceViewer {
     this.client = client;
     this.loadedHash = "";
     this.view = "beauty";
+    this.hasDrawn = false;
     /** @type {Map<string, string>} */
     this.switches = new Map();
   }
@@ -33,15 +34,39 @@ export class FaceViewer {
     let module;
     try {
       module = await import("./rhytid_client.js");
-      await module.default({ module_or_path: new URL("./rhytid_client_bg.wasm", import.meta.url) });
+      // Compiled as it comes, and fetched as the page's head has begun to: with the same credentials.
+      await module.default({ module_or_path: fetch(new URL("./rhytid_client_bg.wasm", import.meta.url), { credentials: "same-origin" }) });
+      performance.mark("rhytid:module");
     } catch (error) {
       throw new Error(`The viewer cannot be loaded: ${error instanceof Error ? error.message : error}`);
     }
-    return new FaceViewer(await module.Viewer.start(canvas, { backend, transparent }));
+    const client = await module.Viewer.start(canvas, { backend, transparent });
+    performance.mark("rhytid:device");
+    return new FaceViewer(client);
+  }
+
+  /** Takes over view and switches of another one. @param {FaceViewer} other */
+  takeOver(other) {
+    this.view = other.view;
+    for (const [name, value] of other.switches) this.setSwitch(name, value);
   }
 
   backend() {
     return this.client.backend();
+  }
+
+  /** Why nothing can be drawn any more; undefined while all is well. @returns {string | undefined} */
+  failure() {
+    return this.client.failure();
+  }
+
+  /** Gives everything back. */
+  close() {
+    try {
+      this.client.free();
+    } catch {
+      // A device that is gone may refuse even that.
+    }
   }
 
   /** Takes a view socket's first message. @param {string} text */
@@ -52,6 +77,7 @@ export class FaceViewer {
   /** @param {Uint8Array} glb @param {string} sha256 */
   load(glb, sha256) {
     this.client.loadCharacter(glb);
+    performance.mark("rhytid:character");
     this.loadedHash = sha256;
     for (const [name, value] of this.switches) this.client.setSwitch(name, value);
     if (this.views().includes(this.view)) this.client.setView(this.view);
@@ -74,7 +100,14 @@ export class FaceViewer {
 
   /** Draws where there is something new. @param {number} nowMs @returns {boolean} whether it drew */
   draw(nowMs) {
-    return this.client.draw(nowMs);
+    const isDrawn = this.client.draw(nowMs);
+    if (isDrawn && !this.hasDrawn) {
+      this.hasDrawn = true;
+      performance.mark("rhytid:drawn");
+      // The browser asks for the next picture once it has this one.
+      requestAnimationFrame(() => performance.mark("rhytid:picture"));
+    }
+    return isDrawn;
   }
 
   /** Turns the face by a drag, device pixels. @param {number} dx @param {number} dy */

@@ -40,17 +40,6 @@ export function encodePoints(points, t) {
   return bytes;
 }
 
-/**
- * The same frame as JSON, for servers that take no binary ones.
- * @param {Float32Array} points @param {number} t
- */
-export function pointsAsJson(points, t) {
-  const landmarks = [];
-  const short = (/** @type {number} */ value) => Math.round(value * 100) / 100;
-  for (let i = 0; i < points.length; i += 3) landmarks.push([short(points[i]), short(points[i + 1]), short(points[i + 2])]);
-  return { type: "frame", t, landmarks };
-}
-
 /** Reads when the frames of packets were captured, by the sender's clock, out of the packets' heads. */
 export class PacketTimes {
   constructor() {

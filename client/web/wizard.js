@@ -1,6 +1,7 @@
 // The guided fit: eight faces in about twenty seconds, measured by the server, kept as a profile.
 
-import { byId, element } from "./util.js";
+import { answerOf, isRefusal } from "./questions.js";
+import { ROOM_NAME, byId, element } from "./util.js";
 
 /** @type {{step: string, title: string, text: string}[]} */
 const STEPS = [
@@ -29,15 +30,16 @@ export class Wizard {
   /**
    * @param {object} host
    * @param {(message: any, matches: (answer: any) => boolean, patience: number) => Promise<any>} host.ask
-   * @param {(profile: any) => void} host.done takes the new profile
+   * @param {(answer: any) => string} host.done takes the answer with the new profile; gives a sentence on where it is kept
    * @param {(offers: Record<string, boolean>) => void} host.apply takes the settings the person agreed to
    * @param {(profile: any) => void} host.save gives the profile as a file
    * @param {(isOpen: boolean) => void} host.opened
+   * @param {boolean} hasPicture whether the person's own picture is shown
    */
-  constructor(host) {
+  constructor(host, hasPicture) {
     this.host = host;
-    /** @type {HTMLDialogElement} */
-    this.dialog = byId("wizard");
+    this.dialog = dialog(hasPicture);
+    this.name = "";
     this.run = 0;
     this.isOpen = false;
     this.isRunning = false;
@@ -54,15 +56,32 @@ export class Wizard {
     return byId("wizard-self");
   }
 
-  open() {
+  /** @param {string} [whom] who is fitted, in words */
+  open(whom = "") {
     this.isOpen = true;
     this.host.opened(true);
     this.#bars(-1, []);
     byId("wizard-count").textContent = "";
-    byId("wizard-title").textContent = "Fit to my face";
-    byId("wizard-text").replaceChildren(element("p", {}, "Eight faces, twenty seconds. Make each as strongly as you can and hold it until the bar is full."));
-    this.#buttons(["Start", () => this.go(), true], ["Cancel", () => this.cancel()]);
+    byId("wizard-title").textContent = whom ? "Fit the performer" : "Fit to my face";
+    const name = element("input", { id: "wizard-name", maxLength: 64, autocomplete: "off", spellcheck: false, value: this.name, placeholder: "none", "aria-describedby": "wizard-wrong" });
+    const wrong = element("p", { id: "wizard-wrong", class: "note", role: "alert" });
+    byId("wizard-text").replaceChildren(
+      element("p", {}, "Eight faces, twenty seconds. Make each as strongly as you can and hold it until the bar is full."),
+      ...(whom ? [element("p", { class: "quiet" }, `The person in front of ${whom} must see this page.`)] : []),
+      element("p", { class: "wizard-field" }, element("label", { for: "wizard-name" }, "The profile’s name"), name), wrong);
+    const start = () => {
+      const text = name.value.trim();
+      if (text && !ROOM_NAME.test(text)) {
+        wrong.textContent = "A name has letters, digits, “_” or “-”, no spaces.";
+        name.focus();
+        return;
+      }
+      this.name = text;
+      this.go();
+    };
+    this.#buttons(["Start", start, true], ["Cancel", () => this.cancel()]);
     this.dialog.showModal();
+    this.#focus();
   }
 
   close() {
@@ -73,7 +92,7 @@ export class Wizard {
   }
 
   cancel() {
-    if (this.isRunning) this.host.ask({ type: "fit", step: "cancel" }, (answer) => answer.type === "fit" || answer.type === "error", 500).catch(() => {});
+    if (this.isRunning) this.host.ask({ type: "fit", step: "cancel" }, answerOf("fit"), 500).catch(() => {});
     this.isRunning = false;
     this.close();
   }
@@ -98,7 +117,7 @@ export class Wizard {
       if (isOver()) return;
       const bar = /** @type {HTMLElement | null} */ (byId("wizard-steps").children[i]?.firstElementChild);
       const answer = this.host.ask({ type: "fit", step, seconds: HOLD },
-        (message) => (message.type === "fit" && message.step === step && message.done) || message.type === "error", 1000 * HOLD + PATIENCE);
+        (message) => (message.type === "fit" && message.step === step && message.done) || isRefusal(message), 1000 * HOLD + PATIENCE);
       // Watched from the start: a refusal must not wait for the bar.
       const settled = answer.then((value) => ({ value, error: null }), (error) => ({ value: null, error }));
       await this.#count(HOLD, (share) => bar && (bar.style.width = `${100 * share}%`), isOver);
@@ -121,11 +140,11 @@ export class Wizard {
     }
     this.#bars(STEPS.length, results);
     try {
-      const { profile, warnings = [], offers = {} } = await this.host.ask({ type: "fit", step: "finish" }, (message) => message.type === "profile" || message.type === "error", PATIENCE);
+      const finish = { type: "fit", step: "finish", ...(this.name ? { name: this.name } : {}) };
+      const answer = await this.host.ask(finish, answerOf("profile"), PATIENCE);
       if (isOver()) return;
       this.isRunning = false;
-      this.host.done(profile);
-      this.#finished(profile, [...warnings, ...notes], offers);
+      this.#finished(answer, this.host.done(answer), notes);
     } catch (error) {
       if (isOver()) return;
       this.#stopped(/** @type {Error} */ (error).message);
@@ -135,10 +154,6 @@ export class Wizard {
   /** @param {Error & {code?: string}} error @param {boolean} isNeeded @returns {Promise<"again" | "skip" | "cancel">} */
   #problem(error, isNeeded) {
     byId("wizard-count").textContent = "";
-    if (error.code === "unknown_type") {
-      this.#stopped("This server cannot fit a performer: it is an older one.");
-      return Promise.resolve("cancel");
-    }
     byId("wizard-title").textContent = "Once more?";
     byId("wizard-text").replaceChildren(element("p", { role: "alert" }, `${error.message.charAt(0).toUpperCase()}${error.message.slice(1)}.`.replace("..", ".")));
     return new Promise((resolve) => {
@@ -162,8 +177,9 @@ export class Wizard {
     this.#buttons(["Again", () => this.go(), true], ["Close", () => this.close()]);
   }
 
-  /** @param {any} profile @param {string[]} remarks @param {Record<string, boolean>} offers */
-  #finished(profile, remarks, offers) {
+  /** @param {any} answer @param {string} kept where the profile is @param {string[]} notes on the steps */
+  #finished({ profile, warnings = [], offers = {} }, kept, notes) {
+    const remarks = [...warnings, ...notes];
     byId("wizard-count").textContent = "";
     byId("wizard-title").textContent = "Done";
     /** @type {Map<string, HTMLInputElement>} */
@@ -174,7 +190,7 @@ export class Wizard {
       return element("label", { class: "check" }, box, OFFERS[/** @type {keyof typeof OFFERS} */ (name)] ?? name);
     });
     byId("wizard-text").replaceChildren(
-      element("p", {}, "The profile is in use and kept in this browser."),
+      element("p", {}, kept),
       ...(remarks.length ? [element("ul", { class: "wizard-list" }, ...remarks.map((remark) => element("li", {}, remark)))] : []),
       ...offered);
     this.#buttons(
@@ -216,7 +232,11 @@ export class Wizard {
 
   /** @param {...any[]} buttons text, what it does, whether it is the main one */
   #buttons(...buttons) {
-    byId("wizard-buttons").replaceChildren(...buttons.map(([text, act, isMain]) => element("button", { class: isMain ? "primary" : "", onclick: act }, text)));
+    byId("wizard-buttons").replaceChildren(...buttons.map(([text, act, isMain]) => element("button", { type: "button", class: isMain ? "primary" : "", onclick: act }, text)));
+    this.#focus();
+  }
+
+  #focus() {
     /** @type {HTMLElement | null} */ (byId("wizard-buttons").querySelector("button"))?.focus();
   }
 
@@ -231,4 +251,24 @@ export class Wizard {
     pitch.start();
     pitch.stop(sound.currentTime + 0.2);
   }
+}
+
+/**
+ * The dialog that covers the page.
+ * @param {boolean} hasPicture
+ * @returns {HTMLDialogElement}
+ */
+function dialog(hasPicture) {
+  const picture = element("div", { class: "wizard-self" }, element("canvas", { id: "wizard-self", "aria-hidden": "true" }));
+  picture.hidden = !hasPicture;
+  const made = element("dialog", { id: "wizard", "aria-labelledby": "wizard-title" },
+    element("div", { class: "wizard-steps", id: "wizard-steps", role: "progressbar", "aria-label": "Steps done", "aria-valuemin": "0" }),
+    element("div", { class: "wizard-middle" },
+      picture,
+      element("h2", { id: "wizard-title", "aria-live": "assertive" }),
+      element("div", { id: "wizard-text" }),
+      element("div", { class: "wizard-count", id: "wizard-count", "aria-hidden": "true" })),
+    element("div", { class: "wizard-buttons", id: "wizard-buttons" }));
+  document.body.append(made);
+  return made;
 }

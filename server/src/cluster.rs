@@ -204,12 +204,12 @@ impl Cluster {
         }
     }
 
-    /// Rooms elsewhere, by the node that told of them.
-    pub fn elsewhere(&self) -> Vec<(String, RoomListing)> {
+    /// Rooms elsewhere, all or those of one name, by the node that told of them.
+    pub fn elsewhere(&self, name: Option<&RoomName>) -> Vec<(String, RoomListing)> {
         let mut nodes = lock(&self.nodes);
         nodes.retain(|_, (heard, _)| heard.elapsed() < FORGOTTEN);
         let rooms = nodes.values().flat_map(|(_, told)| told.rooms.iter().map(|room| (told.node.clone(), room.clone())));
-        rooms.collect()
+        rooms.filter(|(_, room)| name.is_none_or(|name| name.as_str() == room.name)).collect()
     }
 
     /// Whose rooms are whose has changed.

@@ -2,9 +2,11 @@
 
 use crate::cluster::ClusterConfig;
 use crate::solve::SolveConfig;
+use crate::token::{self, Keys};
 use crate::trackers::spec::{ListenSpec, VmcOutSpec};
 use rhytid_shared::limits::MAX_MESSAGE_BYTES;
 use serde::Deserialize;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -42,6 +44,26 @@ pub enum ServerConfigError {
         /// The range.
         expected: &'static str,
     },
+    /// Everybody could do everything.
+    #[error(
+        "others can reach this address, so it must be said who may do what: give --token-key FILE (rhytid-server token --new-key FILE \
+         makes one), or --insecure where everybody may do everything"
+    )]
+    Open,
+    /// Everybody could send datagrams to it.
+    #[error(
+        "tokens are demanded, but others can reach {protocol}={address}, and datagrams bear none: say which addresses they may come \
+         from with option allow=IP, or give --insecure"
+    )]
+    OpenPort {
+        /// What it listens for.
+        protocol: &'static str,
+        /// Where.
+        address: SocketAddr,
+    },
+    /// The keys of the tokens cannot be had.
+    #[error(transparent)]
+    Token(#[from] token::TokenError),
     /// A setting of the solve makes no sense.
     #[error(transparent)]
     Solve(#[from] crate::solve::ConfigError),
@@ -112,12 +134,18 @@ pub struct Limits {
     /// Bad frames in a row that end a publisher's session.
     #[arg(id = "max-bad-frames", long = "max-bad-frames", default_value_t = Self::default().bad_frames_in_a_row, value_name = "N")]
     pub bad_frames_in_a_row: u32,
-    /// Connections altogether, each a file descriptor and about 16 KiB.
+    /// Connections altogether, each a file descriptor and about 5 KiB.
     #[arg(id = "max-connections-in-all", long = "max-connections-in-all", default_value_t = Self::default().connections, value_name = "N")]
     pub connections: usize,
     /// Connections from one address, or one /64 of IPv6; does not hold for loopback.
     #[arg(id = "max-connections", long = "max-connections", default_value_t = Self::default().connections_per_address, value_name = "N")]
     pub connections_per_address: usize,
+    /// New connections a second from one address, after a burst of four seconds' worth; does not hold for loopback.
+    #[arg(id = "max-connection-rate", long = "max-connection-rate", default_value_t = Self::default().connections_per_second, value_name = "N")]
+    pub connections_per_second: u32,
+    /// Messages a second from all publishers of one address; faster ones are slowed down. Does not hold for loopback.
+    #[arg(id = "max-address-fps", long = "max-address-fps", default_value_t = Self::default().frames_per_second_per_address, value_name = "N")]
+    pub frames_per_second_per_address: u32,
 }
 
 impl Default for Limits {
@@ -129,10 +157,14 @@ impl Default for Limits {
             // Five percent of a core, and 16 times a fast face camera.
             frames_per_second: 1000,
             bad_frames_in_a_row: 100,
-            // A quarter of a gigabyte of viewers.
+            // Under a hundred megabytes of viewers.
             connections: 16_384,
             // A class behind one router.
             connections_per_address: 256,
+            // A page that loads and its sockets, several times over.
+            connections_per_second: 16,
+            // A studio of sixty faces.
+            frames_per_second_per_address: 4000,
         }
     }
 }
@@ -167,7 +199,7 @@ impl Default for Timeouts {
     }
 }
 
-/// Who may come from a browser. Programs that send no `Origin` are not asked.
+/// Who may come, and from where in a browser. Programs that send no `Origin` are not asked for it.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 pub struct Access {
@@ -177,6 +209,12 @@ pub struct Access {
     /// Origins of other sites whose pages may use and read it, e.g. `https://example.org` (repeat for several).
     #[arg(long = "allow-origin", value_name = "ORIGIN")]
     pub origins: Vec<String>,
+    /// Demand tokens signed with a key of this file (`rhytid-server token` makes both); read again when it changes.
+    #[arg(long = "token-key", value_name = "FILE")]
+    pub token_key: Option<PathBuf>,
+    /// Listen for other machines without tokens, or take tokens without TLS.
+    #[arg(long = "insecure")]
+    pub insecure: bool,
 }
 
 /// Encryption. Without any of it the server speaks plain HTTP. A phone's camera and a browser's WebGPU need it, except on
@@ -200,11 +238,36 @@ impl ServerConfig {
     pub fn from_file(path: &Path) -> Result<Self, ServerConfigError> {
         let shown = path.display().to_string();
         let text = std::fs::read_to_string(path).map_err(|source| ServerConfigError::Io { path: shown.clone(), source })?;
-        toml::from_str(&text).map_err(|error: toml::de::Error| ServerConfigError::Toml {
-            path: shown,
+        Self::from_toml(&text, &shown)
+    }
+
+    /// Reads the text of a file that errors call `shown`.
+    pub(crate) fn from_toml(text: &str, shown: &str) -> Result<Self, ServerConfigError> {
+        toml::from_str(text).map_err(|error: toml::de::Error| ServerConfigError::Toml {
+            path: shown.to_owned(),
             line: 1 + text.bytes().take(error.span().map_or(0, |span| span.start)).filter(|byte| *byte == b'\n').count(),
             problem: error.message().lines().collect::<Vec<_>>().join(", "),
         })
+    }
+
+    /// Checks that a server on `address` knows who may do what: off loopback it needs keys of tokens, or to be told that it
+    /// does not.
+    pub fn check_access(&self, address: SocketAddr) -> Result<(), ServerConfigError> {
+        self.keys(address).map(drop)
+    }
+
+    /// The keys of the tokens, where a server on `address` demands them. Datagrams bear none, so then it must be said where they
+    /// may come from.
+    pub(crate) fn keys(&self, address: SocketAddr) -> Result<Option<Keys>, ServerConfigError> {
+        let access = &self.access;
+        let keys = token::demand(access.token_key.as_deref(), access.insecure, address.ip().is_loopback())?;
+        let is_open = |port: &&ListenSpec| port.allow.is_empty() && !port.address.ip().is_loopback();
+        match self.listen_udp.iter().find(is_open) {
+            Some(port) if keys.is_some() && !access.insecure => {
+                Err(ServerConfigError::OpenPort { protocol: port.protocol_name(), address: port.address })
+            }
+            _ => Ok(keys),
+        }
     }
 
     /// Checks every value.
@@ -217,6 +280,8 @@ impl ServerConfig {
             ("limits.bad_frames_in_a_row", limits.bad_frames_in_a_row as usize, 1_000_000),
             ("limits.connections", limits.connections, 1_000_000),
             ("limits.connections_per_address", limits.connections_per_address, 1_000_000),
+            ("limits.connections_per_second", limits.connections_per_second as usize, 1_000_000),
+            ("limits.frames_per_second_per_address", limits.frames_per_second_per_address as usize, 1_000_000),
         ] {
             if got == 0 || got > most {
                 return Err(ServerConfigError::Range { field, got: got.to_string(), expected: "1 to 1000000" });

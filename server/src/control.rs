@@ -2,6 +2,8 @@
 //! neutral face, the guided fit. It takes and gives the messages of a publish socket, without frames.
 
 use crate::config::seconds;
+use crate::http::Pass;
+use crate::publish::until;
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
 use crate::source::{Control, Told};
@@ -47,11 +49,12 @@ impl Target {
 }
 
 /// Takes commands until one side ends it.
-pub(crate) async fn talk(target: Target, mut socket: Socket) {
+pub(crate) async fn talk(target: Target, mut socket: Socket, pass: Pass) {
     let mut shutdown = target.hub.shutdown.clone();
     let Err(stop) = tokio::select! {
         biased;
         () = stopped(&mut shutdown) => Err(Ending::shutdown().into()),
+        () = until(pass.expires) => Err(Ending::token_expired().into()),
         result = run(&target, &mut socket) => result,
     };
     end(socket, stop, &target.hub.metrics).await;

@@ -154,6 +154,8 @@ pub struct LiveFit {
     pub hold: Duration,
     /// Whom to trust where `to` is `wss://`.
     pub trust: Trust,
+    /// What lets it in, where the server wants to know. Sent over TLS or to this machine only.
+    pub token: Option<String>,
 }
 
 /// How a person is guided through the fit.
@@ -191,7 +193,7 @@ enum Answer {
 /// Guides a performer before a live tracker through the fit.
 pub async fn fit_live(options: &LiveFit, guide: &mut impl Guide) -> Result<Profile, FitCliError> {
     let url = format!("{}/v1/rooms/{}/control?slot={}", options.to.trim_end_matches('/'), options.room, options.slot);
-    let mut socket = connect(url, &options.trust, PATIENCE).await?;
+    let mut socket = connect(url, &options.trust, options.token.as_deref(), PATIENCE).await?;
     let hold = options.hold.as_secs_f64();
     let num_steps = FitStep::ALL.len();
     for (i, step) in FitStep::ALL.into_iter().enumerate() {

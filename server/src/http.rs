@@ -1,8 +1,9 @@
 //! What is asked for over HTTP: pages, listings, the character, and the two kinds of WebSocket.
 
 use crate::config::Access;
-use crate::service::{Hub, Peer};
-use crate::socket::{Ending, ErrorMessage, Handshake, close, upgrade};
+use crate::service::{Hub, Peer, Place};
+use crate::socket::{Ending, ErrorMessage, Handshake, close, tokens, upgrade};
+use crate::token::{Refusal, Role, now_seconds};
 use crate::{control, page, publish, room, viewer};
 use axum::Router;
 use axum::body::Bytes;
@@ -11,9 +12,12 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use rhytid_shared::view::TOKEN_PROTOCOL;
 use rhytid_shared::{RoomName, Slot};
 use std::net::IpAddr;
 use std::sync::Arc;
+use std::time::Duration;
+use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
 /// All routes.
@@ -22,6 +26,7 @@ pub(crate) fn router(hub: Arc<Hub>) -> Router {
         .route("/", get(start_page))
         .route("/healthz", get(health))
         .route("/metrics", get(metrics))
+        .route("/api/access", get(access))
         .route("/api/rooms", get(rooms))
         .route("/api/trackers", get(trackers))
         .route("/api/profiles", get(profiles))
@@ -102,6 +107,54 @@ fn host_name(host: &str) -> &str {
     }
 }
 
+/// What somebody who was let in may do.
+#[derive(Clone)]
+pub(crate) struct Pass {
+    /// When the token's time is over.
+    pub expires: Option<Instant>,
+    /// The connection's place among all.
+    pub place: Option<Arc<Place>>,
+}
+
+/// Lets a request in whose token allows `role`, in `room` where it is about one; or says why not.
+fn admit(hub: &Hub, request: &Request, role: Role, room: Option<&RoomName>) -> Result<Pass, Box<Response>> {
+    let place = request.extensions().get::<Arc<Place>>().cloned();
+    let Some(checker) = &hub.tokens else { return Ok(Pass { expires: None, place }) };
+    let is_near = request.extensions().get::<Peer>().is_some_and(|peer| peer.0.ip().to_canonical().is_loopback());
+    let is_safe = hub.is_encrypted || is_near || hub.config.access.insecure;
+    let end = bearer(request.headers()).ok_or(Refusal::Missing).and_then(|token| {
+        // Whoever listens on the way has it by now, but learns not to use it.
+        if is_safe { checker.check(token)?.allow(role, room) } else { Err(Refusal::InTheClear) }
+    });
+    match end {
+        Ok(end) => Ok(Pass { expires: Some(Instant::now() + Duration::from_secs(end.saturating_sub(now_seconds()))), place }),
+        Err(refusal) => {
+            let (code, words) = refusal.words();
+            hub.metrics.end(code);
+            tracing::warn!(code, peer = ?request.extensions().get::<Peer>(), "request refused");
+            let status = match refusal {
+                Refusal::Missing | Refusal::Bad | Refusal::Expired => StatusCode::UNAUTHORIZED,
+                Refusal::InTheClear | Refusal::Role | Refusal::Room => StatusCode::FORBIDDEN,
+            };
+            let mut answer = ErrorMessage::new(code, words).response(status);
+            if status == StatusCode::UNAUTHORIZED {
+                answer.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
+            }
+            Err(answer.into())
+        }
+    }
+}
+
+/// The token of a request: from its header, or from among the subprotocols, the one place a browser's page can put one for a
+/// WebSocket. Never from the address, which is logged on the way.
+fn bearer(headers: &HeaderMap) -> Option<&str> {
+    let from_header = headers.get(header::AUTHORIZATION).and_then(|value| {
+        let (scheme, token) = value.to_str().ok()?.split_once(' ')?;
+        scheme.eq_ignore_ascii_case("bearer").then(|| token.trim())
+    });
+    from_header.or_else(|| tokens(headers, &header::SEC_WEBSOCKET_PROTOCOL).find_map(|word| word.strip_prefix(TOKEN_PROTOCOL)))
+}
+
 async fn start_page(State(hub): State<Arc<Hub>>, request: Request) -> Response {
     page::answer(request.method(), "/", request.headers(), &hub.config.access).unwrap_or_else(|| page::stand_in(&hub.config.access))
 }
@@ -111,9 +164,37 @@ async fn other(State(hub): State<Arc<Hub>>, request: Request) -> Response {
         .unwrap_or_else(|| ErrorMessage::new("not_found", "there is nothing at this address").response(StatusCode::NOT_FOUND))
 }
 
+/// Whether the bearer of the request's token may act as `role` in `room`, or in all of them. A browser's page, which cannot
+/// read why a socket was refused, asks here.
+async fn access(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    let role = match query_field(&request, "role") {
+        Some("view") => Role::View,
+        Some("publish") => Role::Publish,
+        Some("admin") => Role::Admin,
+        _ => {
+            return ErrorMessage::new("unknown_role", "query field role is expected to be view, publish or admin")
+                .response(StatusCode::BAD_REQUEST);
+        }
+    };
+    let room = match query_field(&request, "room").map(room_name).transpose() {
+        Ok(room) => room,
+        Err(error) => return error.response(StatusCode::BAD_REQUEST),
+    };
+    match admit(&hub, &request, role, room.as_ref()) {
+        Ok(pass) => {
+            let seconds = pass.expires.map(|end| end.saturating_duration_since(Instant::now()).as_secs());
+            axum::Json(serde_json::json!({ "tokens": hub.tokens.is_some(), "seconds": seconds })).into_response()
+        }
+        Err(answer) => *answer,
+    }
+}
+
 /// In Prometheus's own format, or as OpenMetrics where the reader names that.
-async fn metrics(State(hub): State<Arc<Hub>>, headers: HeaderMap) -> Response {
-    let mut accepted = headers.get_all(header::ACCEPT).into_iter().filter_map(|value| value.to_str().ok());
+async fn metrics(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    if let Err(answer) = admit(&hub, &request, Role::Admin, None) {
+        return *answer;
+    }
+    let mut accepted = request.headers().get_all(header::ACCEPT).into_iter().filter_map(|value| value.to_str().ok());
     let (kind, text) = if accepted.any(|value| value.contains("application/openmetrics-text")) {
         ("application/openmetrics-text; version=1.0.0; charset=utf-8", hub.metrics.open_metrics())
     } else {
@@ -130,19 +211,41 @@ async fn health(State(hub): State<Arc<Hub>>) -> String {
     }
 }
 
-/// This node's rooms and, where there are others, theirs; each once, as its home tells of it.
-async fn rooms(State(hub): State<Arc<Hub>>) -> Response {
-    let own = hub.rooms.list();
+/// All rooms, for who may do everything; or the one that the query names, for who may watch it. Where there are other nodes,
+/// theirs, too: each room once, as its home tells of it.
+async fn rooms(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    let asked = match admit_to_listing(&hub, &request, Role::View) {
+        Ok(asked) => asked,
+        Err(answer) => return *answer,
+    };
+    let own = match &asked {
+        Some(name) => hub.rooms.find(name).iter().map(|room| room.listing()).collect(),
+        None => hub.rooms.list(),
+    };
     let Some(cluster) = &hub.cluster else { return axum::Json(serde_json::json!({ "rooms": own })).into_response() };
-    let rooms = room::merge(cluster.node(), own, cluster.elsewhere());
+    let rooms = room::merge(cluster.node(), own, cluster.elsewhere(asked.as_ref()));
     axum::Json(serde_json::json!({ "node": cluster.node(), "rooms": rooms })).into_response()
 }
 
-async fn trackers(State(hub): State<Arc<Hub>>) -> Response {
+/// Lets in who may see a listing: of the room that the query names, as `role`, or of all there is.
+fn admit_to_listing(hub: &Hub, request: &Request, role: Role) -> Result<Option<RoomName>, Box<Response>> {
+    let room = query_field(request, "room").map(room_name).transpose().map_err(|error| error.response(StatusCode::BAD_REQUEST))?;
+    admit(hub, request, if room.is_some() { role } else { Role::Admin }, room.as_ref())?;
+    Ok(room)
+}
+
+async fn trackers(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    if let Err(answer) = admit(&hub, &request, Role::Admin, None) {
+        return *answer;
+    }
     axum::Json(serde_json::json!({ "ports": hub.trackers.list() })).into_response()
 }
 
-async fn profiles(State(hub): State<Arc<Hub>>) -> Response {
+/// For who may do everything, or who publishes to the room that the query names: a publisher chooses one of them by name.
+async fn profiles(State(hub): State<Arc<Hub>>, request: Request) -> Response {
+    if let Err(answer) = admit_to_listing(&hub, &request, Role::Publish) {
+        return *answer;
+    }
     axum::Json(serde_json::json!({ "profiles": hub.profiles.list() })).into_response()
 }
 
@@ -174,8 +277,12 @@ async fn publish_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, r
         Ok(handshake) => handshake,
         Err(answer) => return *answer,
     };
+    let pass = match admit(&hub, &request, Role::Publish, Some(&room)) {
+        Ok(pass) => pass,
+        Err(answer) => return *answer,
+    };
     let config = publish::socket_config(&hub);
-    upgrade(&hub.clone(), request, handshake, config, Vec::new(), move |socket| publish::talk(hub, socket, room))
+    upgrade(&hub.clone(), request, handshake, config, Vec::new(), move |socket| publish::talk(hub, socket, room, pass))
 }
 
 async fn control_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, request: Request) -> Response {
@@ -188,9 +295,14 @@ async fn control_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, r
         Ok(handshake) => handshake,
         Err(answer) => return *answer,
     };
+    // Who speaks for a source may do to its face what its publisher may.
+    let pass = match admit(&hub, &request, Role::Publish, Some(&room)) {
+        Ok(pass) => pass,
+        Err(answer) => return *answer,
+    };
     let config = publish::socket_config(&hub);
     let target = control::Target { hub: hub.clone(), room, slot };
-    upgrade(&hub, request, handshake, config, Vec::new(), move |socket| control::talk(target, socket))
+    upgrade(&hub, request, handshake, config, Vec::new(), move |socket| control::talk(target, socket, pass))
 }
 
 /// A field of the request's query.
@@ -215,12 +327,18 @@ async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, requ
         Ok(handshake) => handshake,
         Err(answer) => return *answer,
     };
+    let pass = match admit(&hub, &request, Role::View, Some(&room)) {
+        Ok(pass) => pass,
+        Err(answer) => return *answer,
+    };
     tracing::debug!(%room, wants_json, peer = ?request.extensions().get::<Peer>(), "viewer connects");
     match hub.rooms.join(&room) {
         Ok(viewing) => {
             let first = viewer::first_frames(&hub, &room);
             let config = viewer::socket_config();
-            upgrade(&hub.clone(), request, handshake, config, first, move |socket| viewer::talk(hub, socket, viewing, wants_json))
+            upgrade(&hub.clone(), request, handshake, config, first, move |socket| {
+                viewer::talk(hub, socket, viewing, wants_json, pass.expires)
+            })
         }
         // A browser's page cannot read the answer to a handshake, so the refusal is a message.
         Err(error) => {

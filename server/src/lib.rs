@@ -1,7 +1,7 @@
 //! Takes what trackers see, moves a character's bones with it and streams the solved frames to viewers.
 //!
 //! `solve` and `pipeline` are pure: frames in, packets out. Everything else is the service around them: [`run`] serves,
-//! [`send()`] publishes feed files.
+//! [`send()`] publishes feed files, `load` measures the whole.
 
 #![forbid(unsafe_code)]
 
@@ -12,7 +12,11 @@ mod config;
 mod control;
 pub mod feed;
 mod fit;
+#[doc(hidden)]
+pub mod fuzz;
 mod http;
+#[cfg(target_os = "linux")]
+pub mod load;
 mod metrics;
 mod page;
 pub mod pipeline;
@@ -26,6 +30,7 @@ pub mod solve;
 mod source;
 mod stream;
 mod tls;
+mod token;
 pub mod trackers;
 mod viewer;
 
@@ -37,5 +42,6 @@ pub use profiles::ProfileError;
 pub use send::{SendError, SendOptions, SendReport, SendSource, send};
 pub use service::{ServerError, bind, load_character, run};
 pub use tls::{Identity, TlsError};
+pub use token::{Claims, Role, TokenError, make_key_file, make_token};
 pub use trackers::fake::{FakeError, FakeKind, FakeOptions, fake};
 pub use trackers::spec::{ListenSpec, RoomRule, SpecError, VmcOutSpec};

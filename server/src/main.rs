@@ -1,4 +1,8 @@
-//! The server's command line: `serve`, `send`, `fit` and `fake`.
+//! The server's command line: `serve`, `send`, `fit`, `fake`, `token` and `load`.
+
+#[cfg(target_os = "linux")]
+mod load_command;
+mod token_command;
 
 use anyhow::{Context, ensure};
 use clap::{Args, Parser, Subcommand};
@@ -41,6 +45,15 @@ enum Command {
     Fit(FitArgs),
     /// Play another program's tracker from a feed file, to try its protocol without it.
     Fake(FakeArgs),
+    /// Make a token, or a key that signs tokens.
+    Token(token_command::TokenArgs),
+    /// Measure: a server on one core, its publishers and viewers on another.
+    #[cfg(target_os = "linux")]
+    Load(load_command::LoadArgs),
+    /// What `load --baseline` measures against.
+    #[cfg(target_os = "linux")]
+    #[command(hide = true)]
+    PlainServer,
 }
 
 #[derive(Args)]
@@ -117,10 +130,12 @@ struct SendArgs {
     /// public ones
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     trust: Trust,
+    #[command(flatten)]
+    token: token_command::GivenToken,
 }
 
 fn parse_trust(text: &str) -> Result<Trust, String> {
-    if text.is_empty() { Ok(Trust::Public) } else { Trust::from_argument(text, |path| std::fs::read(path)) }
+    Trust::from_argument(text, |path| std::fs::read(path))
 }
 
 fn parse_profile(text: &str) -> Result<ProfileChoice, String> {
@@ -166,6 +181,8 @@ struct FitArgs {
     /// Whom to trust on wss://, as of `send`.
     #[arg(long, value_name = "FINGERPRINT|FILE.pem", value_parser = parse_trust, default_value = "", hide_default_value = true)]
     trust: Trust,
+    #[command(flatten)]
+    token: token_command::GivenToken,
 }
 
 fn parse_name(text: &str) -> Result<RoomName, String> {
@@ -233,6 +250,11 @@ async fn main() -> ExitCode {
         Command::Send(args) => send_feed(args).await,
         Command::Fit(args) => fit(args).await,
         Command::Fake(args) => fake_feed(args).await,
+        Command::Token(args) => token_command::token(&args),
+        #[cfg(target_os = "linux")]
+        Command::Load(args) => load_command::load(args).await,
+        #[cfg(target_os = "linux")]
+        Command::PlainServer => load_command::plain_server().await,
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -246,8 +268,8 @@ async fn main() -> ExitCode {
 /// Logs go to standard error; `RUST_LOG` overrules `-v`.
 fn start_log(cli: &Cli) {
     let level = match (cli.verbose, &cli.command) {
-        (0, Command::Send(_) | Command::Fit(_) | Command::Fake(_)) => "warn",
         (0, Command::Serve(_)) => "rhytid_server=info,warn",
+        (0, _) => "warn",
         (1, _) => "rhytid_server=debug,info",
         _ => "debug",
     };
@@ -278,6 +300,8 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "max-bad-frames": limits.bad_frames_in_a_row,
         "max-connections-in-all": limits.connections,
         "max-connections": limits.connections_per_address,
+        "max-connection-rate": limits.connections_per_second,
+        "max-address-fps": limits.frames_per_second_per_address,
         "hello-timeout": timeouts.hello,
         "ping-interval": timeouts.ping,
         "publisher-timeout": timeouts.publisher_idle,
@@ -295,6 +319,8 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);
     config.access.origins.extend(args.access.origins);
+    config.access.token_key = args.access.token_key.or(config.access.token_key);
+    config.access.insecure |= args.access.insecure;
     // Given by flags it is whole, whatever the file says.
     if args.tls != Tls::default() {
         config.tls = args.tls;
@@ -306,6 +332,7 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     // Before the port is bound: who sees the line below may connect, and a broken character must not leave a port behind.
     let character = load_character(config.character.as_deref())?;
     let listener = bind(&config.listen).await?;
+    config.check_access(listener.local_addr()?)?;
     let identity = Identity::load(&config.tls, listener.local_addr()?, &config.access.hosts)?;
     let scheme = if identity.is_some() { "https" } else { "http" };
     let mut greeting = format!("listening on {scheme}://{}\n", listener.local_addr()?);
@@ -392,6 +419,7 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
         profile: args.profile,
         timeout: args.timeout,
         trust: args.trust,
+        token: args.token.read()?,
     };
     let mut interrupt = Signals::new().context("cannot wait for signals")?;
     let report = send(&options, &progress, async move { interrupt.wait().await }).await;
@@ -403,7 +431,7 @@ async fn send_feed(args: SendArgs) -> anyhow::Result<()> {
 }
 
 async fn fit(args: FitArgs) -> anyhow::Result<()> {
-    let FitArgs { feed, out, steps, name, to, room, slot, ready, hold, yes, trust } = args;
+    let FitArgs { feed, out, steps, name, to, room, slot, ready, hold, yes, trust, token } = args;
     let profile = if let Some(feed) = feed {
         let (character, _) = load_character(None)?;
         let report = fit_feed(&feed, &character, steps, name.as_ref(), |line| eprintln!("{line}"))?;
@@ -416,8 +444,8 @@ async fn fit(args: FitArgs) -> anyhow::Result<()> {
         }
         profile
     } else {
-        let options =
-            LiveFit { to, room: room.to_string(), slot: slot.to_string(), name: name.map(|name| name.to_string()), ready, hold, trust };
+        let (room, slot, name) = (room.to_string(), slot.to_string(), name.map(|name| name.to_string()));
+        let options = LiveFit { to, room, slot, name, ready, hold, trust, token: token.read()? };
         fit_live(&options, &mut Terminal { yes }).await?
     };
     write_profile(&profile, &out).with_context(|| format!("cannot write {}", out.display()))?;

@@ -2,6 +2,7 @@
 
 use crate::answer::Answer;
 use crate::config::seconds;
+use crate::http::Pass;
 use crate::room::RoomError;
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
@@ -29,8 +30,8 @@ pub(crate) fn socket_config(hub: &Hub) -> WebSocketConfig {
 }
 
 /// Takes a publisher's messages until one side ends it.
-pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName) {
-    let Err(stop) = publish(&hub, &mut socket, &room).await;
+pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName, pass: Pass) {
+    let Err(stop) = publish(&hub, &mut socket, &room, &pass).await;
     if let Stop::End(ending) = &stop {
         tracing::info!(%room, reason = %ending.reason, "publisher ended by the server");
     }
@@ -39,7 +40,7 @@ pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, room: RoomName) {
 
 /// Waits for the hello, claims the room and takes messages, however long each step may block, until the session ends, the
 /// service ends, another publisher takes the room, or nothing is heard any more.
-async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infallible, Stop> {
+async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName, pass: &Pass) -> Result<Infallible, Stop> {
     let timeouts = &hub.config.timeouts;
     let mut shutdown = hub.shutdown.clone();
     let mut reader = PublishReader::new(&hub.character);
@@ -64,11 +65,12 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName) -> Result<Infa
     }
     let (source, evicted) = Source::open(hub, room, hello).map_err(not_opened)?;
     let heard = Heard::now();
-    let mut session = Session::new(hub, source, reader);
+    let mut session = Session::new(hub, pass, source, reader);
     Err(tokio::select! {
         biased;
         () = stopped(&mut shutdown) => Ending::shutdown().into(),
         _ = evicted => taken_over(),
+        () = until(pass.expires) => Ending::token_expired().into(),
         result = session.run(socket, &heard) => match result { Err(stop) => stop },
         () = heard.silence(seconds(timeouts.publisher_idle)) => {
             refusal("idle", format!("nothing heard for {} seconds", timeouts.publisher_idle))
@@ -90,6 +92,7 @@ async fn read_hello(hub: &Hub, socket: &mut Socket, reader: &mut PublishReader) 
 /// A publisher that has claimed its slot.
 struct Session<'a> {
     hub: &'a Hub,
+    pass: &'a Pass,
     source: Source,
     reader: PublishReader,
     frame: TrackingFrame,
@@ -100,9 +103,10 @@ struct Session<'a> {
 }
 
 impl<'a> Session<'a> {
-    fn new(hub: &'a Hub, source: Source, reader: PublishReader) -> Self {
+    fn new(hub: &'a Hub, pass: &'a Pass, source: Source, reader: PublishReader) -> Self {
         Self {
             hub,
+            pass,
             source,
             reader,
             frame: TrackingFrame::default(),
@@ -193,9 +197,12 @@ impl<'a> Session<'a> {
     /// Slows a sender that is too fast, whatever it sends: nothing is read meanwhile, so its own socket fills up. Its frames
     /// are not dropped.
     async fn hold_back(&mut self, socket: &mut Socket, heard: &Heard) -> Result<(), Stop> {
-        let Some(until) = self.messages.take(Instant::now()) else { return Ok(()) };
+        let now = Instant::now();
+        let by_address = self.pass.place.as_ref().and_then(|place| place.take_message(now.into_std())).map(Instant::from_std);
+        let Some(until) = self.messages.take(now).max(by_address) else { return Ok(()) };
         if !std::mem::replace(&mut self.has_told_rate, true) {
-            let most = self.hub.config.limits.frames_per_second;
+            let limits = &self.hub.config.limits;
+            let most = if by_address.is_some() { limits.frames_per_second_per_address } else { limits.frames_per_second };
             let message = format!("more than {most} messages a second: the server reads no faster, no frame is dropped");
             send_json(socket, &ErrorMessage::new("too_fast", message), seconds(self.hub.config.timeouts.write)).await?;
         }
@@ -254,6 +261,14 @@ fn not_opened(error: OpenError) -> Stop {
 /// The end of a publisher that does not keep the rules.
 fn refusal(code: &'static str, message: String) -> Stop {
     Ending::error(CloseCode::Policy, ErrorMessage::new(code, message)).into()
+}
+
+/// Done at `end`, where there is one.
+pub(crate) async fn until(end: Option<Instant>) {
+    match end {
+        Some(end) => tokio::time::sleep_until(end).await,
+        None => std::future::pending().await,
+    }
 }
 
 fn taken_over() -> Stop {

@@ -180,7 +180,7 @@ struct Publisher {
 /// A room as `/api/rooms` lists it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RoomListing {
-    name: String,
+    pub name: String,
     viewers: usize,
     /// Publishers the room has had.
     session: u32,
@@ -413,6 +413,13 @@ impl Rooms {
         self.metrics.rooms.set(by_name.len() as i64);
     }
 
+    /// Wakes every viewer as a new state would: they look whether the service ends.
+    pub fn wake_viewers(&self) {
+        for room in lock(&self.by_name).values() {
+            room.slot.send_modify(|_| {});
+        }
+    }
+
     /// All rooms, by name.
     pub fn list(&self) -> Vec<RoomListing> {
         let rooms: Vec<Arc<Room>> = lock(&self.by_name).values().cloned().collect();
@@ -456,7 +463,8 @@ impl Room {
         state.publishers.iter().find(|publisher| publisher.claim.slot.name == slot).map(|publisher| publisher.controls.clone())
     }
 
-    fn listing(&self) -> RoomListing {
+    /// Who publishes to it and who watches.
+    pub fn listing(&self) -> RoomListing {
         let state = lock(&self.state);
         let now = self.now();
         let first = state.publishers.iter().max_by_key(|publisher| (publisher.claim.slot.priority, publisher.session));

@@ -19,7 +19,7 @@ use tokio::net::TcpStream;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-use tokio_tungstenite::tungstenite::http::{HeaderValue, header};
+use tokio_tungstenite::tungstenite::http::{HeaderValue, Uri, header};
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::{self, Message};
 use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
@@ -85,6 +85,8 @@ pub struct SendOptions {
     pub timeout: Duration,
     /// Whom to trust where `to` is `wss://`.
     pub trust: Trust,
+    /// What lets it in, where the server wants to know. Sent over TLS or to this machine only.
+    pub token: Option<String>,
 }
 
 /// What was sent.
@@ -168,7 +170,7 @@ async fn send_once<R: BufRead>(
     let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
     let connected = tokio::select! {
         () = stop.as_mut() => return Ok(Ending::Stopped),
-        connected = connect(url, &options.trust, options.timeout) => connected?,
+        connected = connect(url, &options.trust, options.token.as_deref(), options.timeout) => connected?,
     };
     let (mut sink, answers) = connected.split();
     let (ready, is_ready) = oneshot::channel();
@@ -215,10 +217,21 @@ async fn send_once<R: BufRead>(
 }
 
 /// Opens a WebSocket of the server's.
-pub(crate) async fn connect(url: String, trust: &Trust, timeout: Duration) -> Result<Socket, SendError> {
+pub(crate) async fn connect(url: String, trust: &Trust, token: Option<&str>, timeout: Duration) -> Result<Socket, SendError> {
     let connecting = async {
         let mut request = url.as_str().into_client_request()?;
         request.headers_mut().insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(SUBPROTOCOL));
+        if let Some(token) = token {
+            if !may_carry_secrets(request.uri()) {
+                return Err(tungstenite::Error::Io(std::io::Error::other(
+                    "a token goes over wss:// only, or to this machine: others on the way could read it",
+                )));
+            }
+            let mut value = HeaderValue::from_str(&format!("Bearer {token}"))
+                .map_err(|_| tungstenite::Error::Io(std::io::Error::other("the token holds characters that no token has")))?;
+            value.set_sensitive(true);
+            request.headers_mut().insert(header::AUTHORIZATION, value);
+        }
         let config = trust.client_config().map_err(|error| tungstenite::Error::Io(std::io::Error::other(error)))?;
         connect_async_tls_with_config(request, None, false, Some(Connector::Rustls(config))).await
     };
@@ -228,6 +241,13 @@ pub(crate) async fn connect(url: String, trust: &Trust, timeout: Duration) -> Re
         Err(_) => format!("no answer within {} s", timeout.as_secs_f64()),
     };
     Err(SendError::Connect { url, problem })
+}
+
+/// Nobody else can read what is sent there.
+fn may_carry_secrets(uri: &Uri) -> bool {
+    let host = uri.host().unwrap_or_default();
+    let address = host.trim_matches(['[', ']']).parse::<std::net::IpAddr>();
+    uri.scheme_str() == Some("wss") || host == "localhost" || address.is_ok_and(|address| address.is_loopback())
 }
 
 /// Why a feed did not get through.

@@ -9,6 +9,7 @@ use crate::room::Rooms;
 use crate::socket::{ErrorMessage, say_and_close};
 use crate::stream::{TimedStream, Wire};
 use crate::tls::{self, Identity, TlsError};
+use crate::token::{Checker, Keys};
 use crate::trackers::listen::{self, Port, Trackers};
 use crate::trackers::vmc_out::{self, VmcOut};
 use axum::extract::Request;
@@ -21,7 +22,7 @@ use std::convert::Infallible;
 use std::future::Future;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, mpsc, watch};
 use tokio_rustls::TlsAcceptor;
@@ -38,6 +39,10 @@ const UNSENT_BYTES: u32 = 4096;
 const MAX_REQUEST_HEAD: usize = 16 << 10;
 /// Connections over a limit that are told so at a time; in a flood the rest are cut without a word.
 const MOST_REFUSALS: usize = 64;
+/// How long a burst of connections or messages from one address may be: so much as is allowed in this time.
+const BURST: Duration = Duration::from_secs(4);
+/// Addresses that are kept in mind at a time, some 100 bytes each.
+const MOST_ADDRESSES: usize = 1 << 16;
 /// A pause where the process has no file descriptor left.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
@@ -84,7 +89,7 @@ pub enum ServerError {
 
 /// Where a connection comes from.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Peer(#[allow(dead_code, reason = "logged with its Debug form")] pub SocketAddr);
+pub(crate) struct Peer(pub SocketAddr);
 
 /// What all tasks share.
 pub(crate) struct Hub {
@@ -102,6 +107,10 @@ pub(crate) struct Hub {
     pub profiles: Arc<Profiles>,
     pub metrics: Arc<Metrics>,
     pub listens_on_loopback: bool,
+    /// Connections are under TLS.
+    pub is_encrypted: bool,
+    /// What tokens are checked with, where they are demanded.
+    pub tokens: Option<Checker>,
     /// True once the service ends.
     pub shutdown: watch::Receiver<bool>,
     /// Every task holds the hub, so this is dropped with the last of them, for which the service waits.
@@ -146,6 +155,7 @@ pub async fn run(
 ) -> Result<(), ServerError> {
     config.validate()?;
     let address = listener.local_addr().map_err(|source| ServerError::Listen { address: config.listen.clone(), source })?;
+    let mut keys = config.keys(address)?;
     let (mut ports, mut outs) = (Vec::new(), Vec::new());
     for spec in &config.listen_udp {
         ports.push(Port::bind(spec).await?);
@@ -177,6 +187,8 @@ pub async fn run(
         trackers: Trackers::default(),
         profiles: Arc::new(profiles),
         listens_on_loopback: address.ip().is_loopback(),
+        is_encrypted: identity.is_some(),
+        tokens: keys.as_ref().map(Keys::checker),
         character,
         glb: glb.into(),
         character_url,
@@ -207,10 +219,14 @@ pub async fn run(
     loop {
         tokio::select! {
             () = &mut shutdown => break,
-            _ = sweep.tick() => hub.rooms.sweep(seconds(hub.config.timeouts.room_idle)),
-            _ = reload.tick() => if let Some(identity) = &mut identity {
-                identity.reload();
-            },
+            _ = sweep.tick() => {
+                hub.rooms.sweep(seconds(hub.config.timeouts.room_idle));
+                hub.connections().forget(Instant::now());
+            }
+            _ = reload.tick() => {
+                identity.iter_mut().for_each(Identity::reload);
+                keys.iter_mut().for_each(Keys::reload);
+            }
             accepted = listener.accept() => match accepted {
                 Ok((stream, peer)) => accept(&hub, stream, peer, &app, acceptor.as_ref()),
                 Err(error) => {
@@ -224,6 +240,7 @@ pub async fn run(
     drop(listener);
     // Receivers live in the hub, so this cannot fail.
     let _ = stop.send(true);
+    hub.rooms.wake_viewers();
     drop((app, hub));
     if tokio::time::timeout(SHUTDOWN_TIMEOUT, tasks_end.recv()).await.is_err() {
         tracing::warn!("some sockets did not close in time");
@@ -317,12 +334,52 @@ fn prepare(stream: &TcpStream) {
 #[derive(Debug, Default)]
 struct Connections {
     total: usize,
-    by_address: HashMap<IpAddr, usize>,
+    by_address: HashMap<IpAddr, Host>,
+}
+
+/// What an address has, and what it may have soon.
+#[derive(Debug, Default)]
+struct Host {
+    connections: usize,
+    arrivals: Allowance,
+    messages: Allowance,
+}
+
+/// So many a second, after a burst.
+#[derive(Debug, Default)]
+struct Allowance {
+    /// When what came so far would have come at the allowed rate.
+    due: Option<Instant>,
+}
+
+impl Allowance {
+    /// Counts one; gives when it would have come at the allowed rate, where that is later than now.
+    fn take(&mut self, per_second: u32, now: Instant) -> Option<Instant> {
+        let due = self.due.unwrap_or(now).max(now.checked_sub(BURST).unwrap_or(now)) + Duration::from_secs(1) / per_second;
+        self.due = Some(due);
+        (due > now).then_some(due)
+    }
+
+    /// Counts one where the rate allows it now.
+    fn take_if_free(&mut self, per_second: u32, now: Instant) -> bool {
+        let is_free = self.due.is_none_or(|due| due <= now);
+        if is_free {
+            // The first one begins a whole burst.
+            self.due.get_or_insert(now.checked_sub(BURST).unwrap_or(now));
+            self.take(per_second, now);
+        }
+        is_free
+    }
+
+    /// Nothing of it needs to be kept in mind.
+    fn is_whole(&self, now: Instant) -> bool {
+        self.due.is_none_or(|due| due + BURST <= now)
+    }
 }
 
 impl Connections {
     /// Counts one more of `address`, unless that is too many.
-    fn take(&mut self, address: Option<IpAddr>, limits: &Limits) -> Result<(), ErrorMessage> {
+    fn take(&mut self, address: Option<IpAddr>, limits: &Limits, now: Instant) -> Result<(), ErrorMessage> {
         let refuse = |who: &str, most: usize| {
             Err(ErrorMessage::new("too_many_connections", format!("{who} has {most} connections already, which is its limit")))
         };
@@ -330,26 +387,40 @@ impl Connections {
             return refuse("the server", limits.connections);
         }
         if let Some(address) = address {
-            let count = self.by_address.entry(address).or_default();
-            if *count >= limits.connections_per_address {
+            if self.by_address.len() >= MOST_ADDRESSES && !self.by_address.contains_key(&address) {
+                return Err(ErrorMessage::new("too_many_connections", "the server has to do with too many addresses"));
+            }
+            let host = self.by_address.entry(address).or_default();
+            if host.connections >= limits.connections_per_address {
                 return refuse("this address", limits.connections_per_address);
             }
-            *count += 1;
+            let most = limits.connections_per_second;
+            if !host.arrivals.take_if_free(most, now) {
+                let message = format!("this address makes more than {most} connections a second, which is its limit");
+                return Err(ErrorMessage::new("too_many_handshakes", message));
+            }
+            host.connections += 1;
         }
         self.total += 1;
         Ok(())
     }
 
+    /// Counts a publisher's message; gives the time before which no other shall be read.
+    fn take_message(&mut self, address: Option<IpAddr>, limits: &Limits, now: Instant) -> Option<Instant> {
+        let host = self.by_address.get_mut(&address?)?;
+        host.messages.take(limits.frames_per_second_per_address, now)
+    }
+
     fn give_back(&mut self, address: Option<IpAddr>) {
         self.total -= 1;
-        if let Some(address) = address
-            && let Some(count) = self.by_address.get_mut(&address)
-        {
-            *count -= 1;
-            if *count == 0 {
-                self.by_address.remove(&address);
-            }
+        if let Some(host) = address.and_then(|address| self.by_address.get_mut(&address)) {
+            host.connections -= 1;
         }
+    }
+
+    /// Forgets addresses that have gone.
+    fn forget(&mut self, now: Instant) {
+        self.by_address.retain(|_, host| host.connections > 0 || !host.arrivals.is_whole(now));
     }
 }
 
@@ -372,9 +443,16 @@ pub(crate) struct Place {
 impl Place {
     fn take(hub: &Arc<Hub>, address: IpAddr) -> Result<Self, ErrorMessage> {
         let address = counted_as(address);
-        hub.connections().take(address, &hub.config.limits)?;
+        hub.connections().take(address, &hub.config.limits, Instant::now())?;
         hub.metrics.connections.inc();
         Ok(Self { hub: hub.clone(), address })
+    }
+
+    /// Counts a publisher's message; gives the time before which no other shall be read.
+    pub fn take_message(&self, now: Instant) -> Option<Instant> {
+        // Loopback, which is not limited, costs no lock.
+        self.address?;
+        self.hub.connections().take_message(self.address, &self.hub.config.limits, now)
     }
 }
 
@@ -408,7 +486,8 @@ mod tests {
         let limits = Limits { connections: 4, connections_per_address: 2, ..Limits::default() };
         let mut connections = Connections::default();
         let of = |text: &str| counted_as(text.parse().unwrap());
-        let mut take = |text: &str| connections.take(of(text), &limits).map_err(|error| error.message);
+        let now = Instant::now();
+        let mut take = |text: &str| connections.take(of(text), &limits, now).map_err(|error| error.message);
         let full = Err("this address has 2 connections already, which is its limit".to_owned());
         assert_eq!(take("192.0.2.1"), Ok(()));
         assert_eq!(take("::ffff:192.0.2.1"), Ok(()), "IPv4 in IPv6's clothes");
@@ -417,10 +496,12 @@ mod tests {
         assert_eq!(take("2001:db8::ffff:2"), Ok(()));
         assert_eq!(take("192.0.2.7"), Err("the server has 4 connections already, which is its limit".to_owned()));
         connections.give_back(of("192.0.2.1"));
-        let mut take = |text: &str| connections.take(of(text), &limits).map_err(|error| error.message);
+        let now = Instant::now();
+        let mut take = |text: &str| connections.take(of(text), &limits, now).map_err(|error| error.message);
         assert_eq!(take("2001:db8::3"), full, "one /64 is one host");
         assert_eq!(take("2001:db8:0:1::1"), Ok(()));
         connections.give_back(of("192.0.2.1"));
+        connections.forget(now + 2 * BURST);
         assert!(!connections.by_address.contains_key(&of("192.0.2.1").unwrap()), "nothing is kept of who has gone");
     }
 
@@ -429,8 +510,44 @@ mod tests {
         let limits = Limits { connections: 3, connections_per_address: 1, ..Limits::default() };
         let mut connections = Connections::default();
         for address in ["127.0.0.1", "127.0.0.1", "::1"] {
-            connections.take(counted_as(address.parse().unwrap()), &limits).unwrap();
+            connections.take(counted_as(address.parse().unwrap()), &limits, Instant::now()).unwrap();
         }
-        assert!(connections.take(None, &limits).is_err(), "but altogether");
+        assert!(connections.take(None, &limits, Instant::now()).is_err(), "but altogether");
+    }
+
+    #[test]
+    fn address_that_connects_again_and_again_is_held_to_its_rate() {
+        let limits = Limits { connections_per_second: 10, ..Limits::default() };
+        let mut connections = Connections::default();
+        let start = Instant::now() + Duration::from_secs(60);
+        let address = counted_as("192.0.2.1".parse().unwrap());
+        // A hundred a second for ten seconds.
+        let mut num_taken = 0;
+        for k in 0..1000 {
+            let now = start + Duration::from_millis(10) * k;
+            if connections.take(address, &limits, now).is_ok() {
+                num_taken += 1;
+                connections.give_back(address);
+                connections.forget(now);
+            }
+        }
+        assert!((135..=145).contains(&num_taken), "{num_taken}: a burst of 40, then 10 a second");
+        let other = counted_as("192.0.2.2".parse().unwrap());
+        assert!(connections.take(other, &limits, start + Duration::from_secs(10)).is_ok(), "others are not held");
+    }
+
+    #[test]
+    fn publishers_of_one_address_share_its_rate() {
+        let limits = Limits { frames_per_second_per_address: 100, ..Limits::default() };
+        let mut connections = Connections::default();
+        let address = counted_as("192.0.2.1".parse().unwrap());
+        let mut now = Instant::now() + Duration::from_secs(60);
+        connections.take(address, &limits, now).unwrap();
+        let start = now;
+        for _ in 0..1000 {
+            now = connections.take_message(address, &limits, now).unwrap_or(now);
+        }
+        assert!((now - start).as_secs_f64() > 5.5, "{:?}", now - start);
+        assert_eq!(connections.take_message(None, &limits, now), None, "loopback");
     }
 }

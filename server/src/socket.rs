@@ -3,6 +3,7 @@
 use crate::metrics::Metrics;
 use crate::service::{Hub, Place, stopped};
 use crate::stream::{TimedStream, Wire};
+use crate::token::Refusal;
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -66,6 +67,12 @@ impl Ending {
     /// Ends with an error message and the same words as the reason of the close.
     pub fn error(code: CloseCode, error: ErrorMessage) -> Self {
         Self { code, reason: error.message.clone(), error: Some(error) }
+    }
+
+    /// What the peer was let in with does not hold any longer.
+    pub fn token_expired() -> Self {
+        let (code, words) = Refusal::Expired.words();
+        Self::error(CloseCode::Policy, ErrorMessage::new(code, words))
     }
 
     /// The server stops.
@@ -157,7 +164,10 @@ where
             return;
         }
         drop(first);
-        talk(WebSocketStream::from_partially_read(stream, parts.read_buf.to_vec(), Role::Server, Some(config)).await).await;
+        // Hyper's buffer is 8 KiB, whatever it holds: what is kept here is kept for as long as the socket lives.
+        let already_read = parts.read_buf.to_vec();
+        drop(parts.read_buf);
+        talk(WebSocketStream::from_partially_read(stream, already_read, Role::Server, Some(config)).await).await;
         drop(place);
     });
     let mut answer = Response::new(Body::empty());
@@ -172,7 +182,7 @@ where
 }
 
 /// The comma-separated words of all headers called `name`.
-fn tokens<'a>(headers: &'a HeaderMap, name: &header::HeaderName) -> impl Iterator<Item = &'a str> {
+pub(crate) fn tokens<'a>(headers: &'a HeaderMap, name: &header::HeaderName) -> impl Iterator<Item = &'a str> {
     headers
         .get_all(name)
         .into_iter()

@@ -24,6 +24,7 @@ mod landmark_session;
 mod landmarks_to_bones;
 mod lids;
 mod linear;
+mod lips;
 mod lower_face;
 pub mod mix;
 mod points;

@@ -217,11 +217,12 @@ pub(crate) async fn shake_hands(hub: &Hub, acceptor: &TlsAcceptor, stream: TcpSt
 
 fn self_signed(address: SocketAddr, names: &[String]) -> Result<CertifiedKey, TlsError> {
     let mut all = vec!["localhost".to_owned(), "127.0.0.1".to_owned(), "::1".to_owned()];
-    if !address.ip().is_unspecified() {
-        all.push(address.ip().to_string());
+    let own = (!address.ip().is_unspecified()).then(|| address.ip().to_string());
+    for name in own.iter().chain(names) {
+        if !all.contains(name) {
+            all.push(name.clone());
+        }
     }
-    all.extend_from_slice(names);
-    all.dedup();
     let key = rcgen::KeyPair::generate()?;
     let mut about = rcgen::CertificateParams::new(all)?;
     about.distinguished_name.push(rcgen::DnType::CommonName, "Rhytid, self-signed");

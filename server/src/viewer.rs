@@ -11,7 +11,9 @@ use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, frame_bytes
 use futures_util::{SinkExt, StreamExt};
 use rhytid_shared::RoomName;
 use rhytid_shared::view::{ViewHello, ViewMessage};
+use std::future::{Future, poll_fn};
 use std::sync::Arc;
+use std::task::Poll;
 use std::time::Duration;
 use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
@@ -54,35 +56,65 @@ pub(crate) fn first_frames(hub: &Hub, room: &RoomName) -> Vec<u8> {
 }
 
 /// Sends `viewing`'s states until one side ends it.
-pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing, wants_json: bool) {
-    let mut shutdown = hub.shutdown.clone();
-    let stop = tokio::select! {
-        biased;
-        () = stopped(&mut shutdown) => Ending::shutdown().into(),
-        stop = run(&hub, &mut socket, &mut viewing, wants_json) => stop,
-    };
+pub(crate) async fn talk(hub: Arc<Hub>, mut socket: Socket, mut viewing: Viewing, wants_json: bool, expires: Option<Instant>) {
+    let stop = run(&hub, &mut socket, &mut viewing, wants_json, expires).await;
     drop(viewing);
     end(socket, stop, &hub.metrics).await;
 }
 
-/// Sends states until the viewer is gone or does not answer. May be dropped at any await.
-async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: bool) -> Stop {
+/// Sends states until the viewer is gone or does not answer, or the service ends.
+///
+/// This is what a frame costs, once for each viewer, so nothing is done twice: the state's slot also says that the service
+/// ends, one timer stays where it is until it is due, and a write gets a time-out only when it has to wait.
+async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: bool, expires: Option<Instant>) -> Stop {
     let timeouts = &hub.config.timeouts;
     let (idle, ping_interval, write) = (seconds(timeouts.viewer_idle), seconds(timeouts.ping), seconds(timeouts.write));
     let mut pace = Pace::new(Instant::now());
     let mut sent = Sent::default();
     // A state that stands there already is news to this viewer.
     viewing.slot.mark_changed();
+    let mut has_news = false;
+    let timer = tokio::time::sleep_until(Instant::now() + idle);
+    tokio::pin!(timer);
     loop {
         let now = Instant::now();
+        if has_news && pace.has_credit(now) {
+            has_news = false;
+            let latest = viewing.slot.borrow_and_update().clone();
+            if let Some(latest) = latest {
+                pace.last_packet = now;
+                let with_ping = pace.takes_ping(now);
+                match within(hub, write, send_state(hub, socket, &latest, wants_json, with_ping, &mut sent)).await {
+                    Ok(true) => {}
+                    Ok(false) => return Stop::Gone("connection_lost"),
+                    Err(stop) => return stop,
+                }
+            }
+        }
         if now >= pace.last_heard + idle {
             let message = format!("no pong for {} seconds", timeouts.viewer_idle);
             return Ending::error(CloseCode::Policy, ErrorMessage::new("idle", message)).into();
         }
-        let has_credit = pace.has_credit(now);
-        let wake = pace.next_wake(ping_interval, now).min(pace.last_heard + idle);
+        if expires.is_some_and(|end| now >= end) {
+            return Ending::token_expired().into();
+        }
+        // Mostly it is due later than the timer says; then the timer is moved when it fires.
+        let end = expires.map_or(pace.last_heard + idle, |end| end.min(pace.last_heard + idle));
+        let wake = pace.next_wake(ping_interval, now).min(end);
+        if wake < timer.deadline() {
+            timer.as_mut().reset(wake);
+        }
         tokio::select! {
             biased;
+            changed = viewing.slot.changed() => {
+                if changed.is_err() {
+                    return Stop::Gone("closed");
+                }
+                if *hub.shutdown.borrow() {
+                    return Ending::shutdown().into();
+                }
+                has_news = true;
+            }
             message = socket.next() => match message {
                 Some(Ok(Message::Pong(_))) => pace.hear(Instant::now()),
                 Some(Ok(Message::Close(_))) | None => return Stop::Gone("closed"),
@@ -90,29 +122,31 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
                 Some(Ok(_)) => {}
                 Some(Err(error)) => return broken(error, LARGEST_MESSAGE),
             },
-            changed = viewing.slot.changed(), if has_credit => {
-                if changed.is_err() {
-                    return Stop::Gone("closed");
-                }
-                let latest = viewing.slot.borrow_and_update().clone();
-                let Some(latest) = latest else { continue };
+            () = timer.as_mut() => {
                 let now = Instant::now();
-                pace.last_packet = now;
-                let with_ping = pace.takes_ping(now);
-                match tokio::time::timeout(write, send_state(hub, socket, &latest, wants_json, with_ping, &mut sent)).await {
-                    Ok(true) => {}
-                    Ok(false) => return Stop::Gone("connection_lost"),
-                    Err(_) => return Stop::Gone("write_timeout"),
-                }
-            }
-            () = tokio::time::sleep_until(wake) => {
-                if pace.takes_ping(Instant::now())
+                if now >= wake
+                    && pace.takes_ping(now)
                     && let Err(stop) = send(socket, Message::Ping(Bytes::new()), write).await
                 {
                     return stop;
                 }
+                timer.as_mut().reset(pace.next_wake(ping_interval, now).min(end));
             }
         }
+    }
+}
+
+/// The output of `sending`, or why it did not get there. The usual case is that the kernel takes everything at once.
+async fn within<T>(hub: &Hub, timeout: Duration, sending: impl Future<Output = T>) -> Result<T, Stop> {
+    tokio::pin!(sending);
+    if let Poll::Ready(output) = poll_fn(|cx| Poll::Ready(sending.as_mut().poll(cx))).await {
+        return Ok(output);
+    }
+    let mut shutdown = hub.shutdown.clone();
+    tokio::select! {
+        biased;
+        () = stopped(&mut shutdown) => Err(Ending::shutdown().into()),
+        output = tokio::time::timeout(timeout, sending) => output.map_err(|_| Stop::Gone("write_timeout")),
     }
 }
 
@@ -276,6 +310,96 @@ mod tests {
                 }
             }
             assert!(num_sent >= least, "{num_sent} of 250 frames at a round trip of {round_trip} ms");
+        }
+    }
+
+    /// A link that keeps its order: packets wait while it stalls, and all of them come when it goes on. Times in milliseconds.
+    #[derive(Debug, Clone)]
+    struct Weather {
+        delay: u64,
+        jitter: u64,
+        stall_every: u64,
+        stall: u64,
+        /// When the connection breaks, and what is under way with it; the viewer comes back after `away`.
+        breaks_at: u64,
+        away: u64,
+    }
+
+    /// What one viewer sees of frames that come every `interval` for `time`: index and time of arrival, connection by connection.
+    fn simulate(weather: &Weather, interval: u64, time: u64, seed: u64) -> Vec<Vec<(u64, u64)>> {
+        let start = Instant::now();
+        let at = |millis: u64| start + Duration::from_millis(millis);
+        let mut random = seed;
+        let mut arrival = |sent: u64, last: u64| {
+            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let mut arrives = sent + weather.delay + (random >> 33) % (weather.jitter + 1);
+            let into = arrives % weather.stall_every;
+            if into < weather.stall {
+                arrives += weather.stall - into;
+            }
+            arrives.max(last)
+        };
+        let mut seen = Vec::new();
+        for (from, to) in [(0, weather.breaks_at), (weather.breaks_at + weather.away, u64::MAX)] {
+            let (mut pace, mut sent_state) = (Pace::new(at(from)), 0);
+            // Pings whose answers are on their way; the first went out with the hello.
+            let mut pongs = std::collections::VecDeque::new();
+            let (mut down, mut up) = (from, from);
+            let mut came = Vec::new();
+            down = arrival(from, down);
+            up = arrival(down, up);
+            pongs.push_back(up);
+            // Long enough after the last frame for a trickle.
+            for now in from..to.min(time + 5000) {
+                while pongs.front().is_some_and(|due| *due <= now) {
+                    pongs.pop_front();
+                    pace.hear(at(now));
+                }
+                // The slot holds the newest state alone.
+                let newest = now.min(time) / interval;
+                if newest > sent_state && pace.has_credit(at(now)) {
+                    pace.last_packet = at(now);
+                    down = arrival(now, down);
+                    if pace.takes_ping(at(now)) {
+                        up = arrival(down, up);
+                        pongs.push_back(up);
+                    }
+                    sent_state = newest;
+                    if down < to {
+                        came.push((newest, down));
+                    }
+                }
+            }
+            seen.push(came);
+        }
+        seen
+    }
+
+    proptest::proptest! {
+        #![proptest_config(proptest::prelude::ProptestConfig::with_cases(64))]
+
+        #[test]
+        fn viewer_never_sees_an_older_frame_after_a_newer_one_and_ends_on_the_last(
+            delay in 0..400_u64, jitter in 0..100_u64, stall_every in 1000..5000_u64, stall in 0..900_u64,
+            breaks_at in 500..8000_u64, away in 0..2000_u64, interval in 1..100_u64, seed: u64,
+        ) {
+            const TIME: u64 = 8000;
+            let weather = Weather { delay, jitter, stall_every, stall, breaks_at, away };
+            let seen = simulate(&weather, interval, TIME, seed);
+            for came in &seen {
+                proptest::prop_assert!(came.windows(2).all(|pair| pair[0].0 < pair[1].0 && pair[0].1 <= pair[1].1), "{weather:?}");
+            }
+            let newest = seen.iter().flatten().map(|(index, _)| *index).collect::<Vec<_>>();
+            proptest::prop_assert!(newest.is_sorted(), "a connection made anew begins with the newest state");
+            proptest::prop_assert_eq!(newest.last(), Some(&(TIME / interval)));
+            // However long the link stalls: what comes then was sent within the window and the ping before it.
+            let most = delay + jitter + stall + stall + WINDOW.as_millis() as u64 + PING_SPACING.as_millis() as u64;
+            for (index, arrived) in seen.iter().flatten() {
+                if (index + 1) * interval < TIME.min(breaks_at) {
+                    let age = arrived - index * interval;
+                    proptest::prop_assert!(age <= most + interval + TRICKLE.as_millis() as u64, "a packet is {age} ms old: {weather:?}");
+                }
+            }
         }
     }
 }

@@ -6,6 +6,7 @@ mod profile;
 mod reader;
 mod settings;
 mod slot;
+mod values;
 
 use crate::face::HeadPose;
 use crate::layout::Layout;
@@ -135,6 +136,9 @@ pub enum Command {
     Profile(ProfileChoice),
 }
 
+/// Most characters of an error, with room for the names of all expressions.
+const MOST_SAID: usize = 2000;
+
 /// Why a publish message was refused. `message` names the field and what was expected.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
@@ -146,8 +150,17 @@ pub struct MessageError {
 }
 
 impl MessageError {
-    /// A refusal with its code and its reason.
+    /// A refusal with its code and its reason, made one line that is not too long: it may repeat what the sender wrote, and goes
+    /// into logs and back over the wire.
     pub fn new(code: &'static str, message: impl Into<String>) -> Self {
-        Self { code, message: message.into() }
+        let mut message = message.into();
+        if let Some((end, _)) = message.char_indices().nth(MOST_SAID) {
+            message.truncate(end);
+            message.push('…');
+        }
+        if message.contains(char::is_control) {
+            message = message.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect();
+        }
+        Self { code, message }
     }
 }

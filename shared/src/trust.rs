@@ -87,9 +87,12 @@ impl FromStr for Fingerprint {
 }
 
 impl Trust {
-    /// As people write it: a fingerprint, or else the name of a PEM file of authorities, which `read` reads. The error is a
-    /// sentence.
+    /// As people write it: nothing for the public authorities, a fingerprint, or else the name of a PEM file of authorities, which
+    /// `read` reads. The error is a sentence.
     pub fn from_argument(text: &str, read: impl FnOnce(&str) -> std::io::Result<Vec<u8>>) -> Result<Self, String> {
+        if text.is_empty() {
+            return Ok(Self::Public);
+        }
         if let Ok(fingerprint) = text.parse() {
             return Ok(Self::Fingerprint(fingerprint));
         }
@@ -186,6 +189,17 @@ mod tests {
         for wrong in ["", "AB", &"é".repeat(32), &"0".repeat(65), &"+1".repeat(32)] {
             assert!(wrong.parse::<Fingerprint>().is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn argument_is_nothing_a_fingerprint_or_a_file() {
+        let unread = |_: &str| -> std::io::Result<Vec<u8>> { panic!("no file was named") };
+        assert_eq!(Trust::from_argument("", unread), Ok(Trust::Public));
+        let fingerprint = Fingerprint::of(b"certificate");
+        assert_eq!(Trust::from_argument(&fingerprint.to_string(), unread), Ok(Trust::Fingerprint(fingerprint)));
+        let missing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
+        assert!(Trust::from_argument("ca.pem", missing).unwrap_err().contains("PEM file"));
+        assert!(Trust::from_argument("ca.pem", |_| Ok(b"no PEM".to_vec())).is_err());
     }
 
     #[test]

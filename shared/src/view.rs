@@ -10,6 +10,8 @@ use std::collections::BTreeMap;
 pub const PROTOCOL_VERSION: u32 = 1;
 /// The WebSocket subprotocol.
 pub const SUBPROTOCOL: &str = "rhytid.v1";
+/// Offered besides [`SUBPROTOCOL`] with a token behind it, where a browser cannot set a header; never chosen by the server.
+pub const TOKEN_PROTOCOL: &str = "rhytid.token.";
 
 /// A text message to a viewer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -24,6 +24,12 @@ const FLAGS = [
   "--enable-unsafe-swiftshader",
 ];
 
+/** WebGPU without a GPU. A canvas of it reaches the page only where the browser itself draws with the same software Vulkan. */
+export const WEBGPU = [
+  "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader",
+  "--use-angle=vulkan",
+];
+
 /** A browser without a window. */
 export function launch(...flags) {
   const { chromium } = required("playwright-core");
@@ -122,3 +128,65 @@ export function difference(a, b, [left, top, right, bottom] = [0, 0, 1, 1]) {
 
 /** A room of this test's own. */
 export const roomName = (stem) => `${stem}-${Date.now().toString(36)}-${Math.floor(Math.random() * 1e6).toString(36)}`;
+
+/** The steps of the guided fit, in their order. */
+export const STEPS = ["neutral", "brows_up", "frown", "smile", "pucker", "jaw_open", "blink", "mouth_left"];
+const TITLES = ["Face at rest", "Brows up", "Frown", "Smile", "Pucker", "Mouth wide open", "Close your eyes", "Mouth to your left"];
+
+/** Somebody with expression weights who makes the fit's faces half as far as a character, and whose mouth goes to the side called the other. */
+const FACES = {
+  neutral: {},
+  brows_up: { browInnerUp: 0.5, browOuterUpLeft: 0.5, browOuterUpRight: 0.5 },
+  frown: { browDownLeft: 0.5, browDownRight: 0.5 },
+  smile: { mouthSmileLeft: 0.5, mouthSmileRight: 0.5 },
+  pucker: { mouthPucker: 0.5 },
+  jaw_open: { jawOpen: 0.5 },
+  blink: { eyeBlinkLeft: 0.5, eyeBlinkRight: 0.5 },
+  mouth_left: { mouthRight: 0.5 },
+};
+
+/** A publisher of weights at 30 frames a second, in a page of its own that draws nothing. `make` a step's face; `close` it. */
+export async function actor(browser, room, hello) {
+  const { page } = await open(browser, "/healthz");
+  await page.evaluate(async ([address, first]) => {
+    const socket = new WebSocket(address, "rhytid.v1");
+    await new Promise((resolve, reject) => Object.assign(socket, { onopen: resolve, onerror: reject }));
+    socket.send(JSON.stringify({ type: "hello", version: 1, fps: 30, ...first }));
+    const ready = await new Promise((resolve) => { socket.onmessage = ({ data }) => resolve(data); });
+    if (!ready.includes('"ready"')) throw new Error(ready);
+    window.weights = {};
+    window.socket = socket;
+    setInterval(() => socket.send(JSON.stringify({ type: "frame", t: performance.now() / 1000, weights: window.weights })), 33);
+  }, [`${URL_OF_SERVER.replace(/^http/, "ws")}/v1/rooms/${room}/publish`, hello]);
+  return { make: (step) => page.evaluate((weights) => { window.weights = weights; }, FACES[step]), close: () => page.close() };
+}
+
+/** A viewer of JSON; `frame` gives the newest frame, null before the first. */
+export async function watcher(browser, room) {
+  const { page } = await open(browser, "/healthz");
+  await page.evaluate((address) => {
+    window.newest = null;
+    new WebSocket(address, "rhytid.v1").onmessage = ({ data }) => {
+      const message = JSON.parse(data);
+      if (message.type === "frame") window.newest = message;
+    };
+  }, `${URL_OF_SERVER.replace(/^http/, "ws")}/v1/rooms/${room}/view?format=json`);
+  return { frame: () => page.evaluate(() => window.newest) };
+}
+
+/** Makes the faces that the page's wizard asks for until it is done; gives the steps it asked for. */
+export async function followWizard(page, performer) {
+  const asked = [];
+  await until("the end of the fit", async () => {
+    const title = await text(page, "#wizard-title");
+    if (title === "Done") return true;
+    const step = STEPS[TITLES.indexOf(title)];
+    if (!step) throw new Error(`the fit says ${title}: ${await text(page, "#wizard-text")}`);
+    if (asked.at(-1) !== step) {
+      asked.push(step);
+      await performer.make(step);
+    }
+    return false;
+  });
+  return asked;
+}

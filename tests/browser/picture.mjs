@@ -4,15 +4,9 @@
 // Environment, besides lib.mjs: RHYTID_JOB a JSON file {backend, size, hello, packets: [[ms, bytes], …], draws: [ms, …], png,
 // mostFirstPicture}, whose `png` is written.
 import fs from "node:fs";
-import { check, launch, open, run } from "./lib.mjs";
+import { WEBGPU, check, launch, open, run } from "./lib.mjs";
 
 const job = JSON.parse(fs.readFileSync(process.env.RHYTID_JOB, "utf8"));
-
-/** WebGPU without a GPU. A canvas of it reaches the page only where the browser itself draws with the same software Vulkan. */
-const WEBGPU = [
-  "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader",
-  "--use-angle=vulkan",
-];
 
 /** Runs in the page. */
 async function draw({ backend, size, hello, packets, draws }) {

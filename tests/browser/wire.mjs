@@ -50,6 +50,17 @@ check("an early delta is early", times.read(delta(1, 7, 3, 9)).micros === 8_123_
 check("a delta of another session says nothing", times.read(delta(2, 7, 3, 0)) === null);
 check("bytes that end early say nothing", times.read(Uint8Array.from([0x12, 1, 2, 0x80])) === null && times.read(new Uint8Array()) === null);
 
+// Tokens.
+const { claims, isToken, splitFragment } = await load("access.js");
+const part = (value) => Buffer.from(JSON.stringify(value)).toString("base64url");
+const token = `${part({ alg: "HS256" })}.${part({ role: "view", rooms: ["d\u00f6>?"], exp: 4e9 })}.${"A".repeat(43)}`;
+check("a token has three parts", isToken(token) && !isToken(token.slice(0, 80)) && !isToken(`${token}.`) && !isToken("a b.c.d") && !isToken(`${token}${"A".repeat(5000)}`));
+check("a token is taken out of the fragment", splitFragment(`#token=${token}`).token === token && splitFragment(`#token=${token}`).rest === "");
+check("what else stands there stays", splitFragment(`#a&token=${token}&b=1`).rest === "#a&b=1");
+check("what is no token is taken out, too", splitFragment("#token=x").token === "" && splitFragment("#token=x").rest === "");
+check("a token says what it is for", claims(token)?.role === "view" && claims(token)?.exp === 4e9);
+check("what is no token says nothing", claims("a.b.c") === null && claims(`a.${part({ role: 3 })}.c`) === null && claims("") === null);
+
 // Reconnecting.
 const [shortest, longest] = [new Backoff(() => 0), new Backoff(() => 0.999999)];
 const waits = Array.from({ length: 12 }, () => [shortest.next(), longest.next()]);

@@ -91,7 +91,7 @@ await run(async () => {
   await until("the swap among the settings", () => heard.settings.at(-1)?.swap_jaw === true);
   check("the profile is named on the page", (await text(page, "#profile-text")).includes("tester"));
   const [file] = await Promise.all([page.waitForEvent("download"), page.click("#profile-save")]);
-  check("the profile can be saved as a file", file.suggestedFilename() === "rhytid-profile.json");
+  check("the profile can be saved as a file", file.suggestedFilename() === "tester.json");
 
   await page.click("#stop");
   await page.click("#start");

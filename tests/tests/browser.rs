@@ -66,10 +66,19 @@ fn main() -> ExitCode {
         trial("qr_codes_can_be_read", has("node") && has_package("jsqr"), || script("qr.mjs", None, &[])),
         trial("webgl2_draws_what_the_native_client_draws", can_draw, || compare("webgl")),
         trial("webgpu_draws_what_the_native_client_draws", can_draw, || compare("webgpu")),
-        trial("the_page_does_what_it_says", lack.is_none(), the_page_does_what_it_says),
+        trial("the_first_picture_comes_soon_with_webgl2", lack.is_none(), || first_picture("webgl")),
+        trial("the_first_picture_comes_soon_with_webgpu", lack.is_none(), || first_picture("webgpu")),
+        trial("the_page_does_what_it_says", lack.is_none(), || on_a_server("page.mjs")),
+        trial("the_page_lets_in_who_has_a_token", lack.is_none(), the_page_lets_in_who_has_a_token),
         trial("the_page_survives_the_server", lack.is_none(), the_page_survives_the_server),
+        trial("a_lost_graphics_device_is_replaced", lack.is_none(), || on_a_server("lost.mjs")),
+        trial("publish_to_shown_picture_takes_so_long_with_webgl2", lack.is_none(), || latency("webgl")),
+        trial("publish_to_shown_picture_takes_so_long_with_webgpu", lack.is_none(), || latency("webgpu")),
+        trial("sources_are_listed_and_told_from_the_page", lack.is_none(), sources_are_listed_and_told_from_the_page),
         trial("a_face_before_the_camera_moves_another_pages_picture", can_track, || with_film("camera.mjs")),
         trial("the_camera_page_fits_a_performer", can_track, || with_film("wizard.mjs")),
+        trial("a_newcomers_way", can_track, a_newcomers_way),
+        trial("the_camera_page_and_the_server_agree", can_track, || with_film("fit.mjs")),
     ];
     libtest_mimic::run(&arguments, trials).exit_code()
 }
@@ -253,15 +262,66 @@ impl Difference {
     }
 }
 
-fn the_page_does_what_it_says() -> Result<()> {
+fn on_a_server(name: &str) -> Result<()> {
     let server = Server::start();
-    script("page.mjs", Some(&server), &[])
+    script(name, Some(&server), &[])
+}
+
+fn first_picture(backend: &str) -> Result<()> {
+    let server = Server::start();
+    let most = MOST_FIRST_PICTURE.to_string();
+    script("first.mjs", Some(&server), &[("RHYTID_BACKEND", Path::new(backend)), ("RHYTID_MOST", Path::new(&most))])
+}
+
+fn latency(backend: &str) -> Result<()> {
+    let server = Server::start();
+    script("latency.mjs", Some(&server), &[("RHYTID_BACKEND", Path::new(backend))])
+}
+
+fn the_page_lets_in_who_has_a_token() -> Result<()> {
+    let folder = tempfile::tempdir()?;
+    let key = folder.path().join("keys");
+    rhytid_server::make_key_file(&key)?;
+    let server = Server::with(|config| config.access.token_key = Some(key.clone()));
+    let make = |role, rooms: &str| rhytid_server::make_token(&key, role, &[rooms.to_owned()], Duration::from_secs(3600));
+    let (view, publish) = (make(rhytid_server::Role::View, "demo")?, make(rhytid_server::Role::Publish, "demo")?);
+    script("access.mjs", Some(&server), &[("RHYTID_VIEW", Path::new(&view)), ("RHYTID_PUBLISH", Path::new(&publish))])
 }
 
 /// Runs a script that shows the film to the browser's camera.
 fn with_film(name: &str) -> Result<()> {
     let server = Server::start();
     script(name, Some(&server), &[("RHYTID_CLIP", &film())])
+}
+
+/// The address of the server's port for trackers.
+fn tracker_port(server: &Server) -> Result<String> {
+    let (_, body) = server.get("/api/trackers", "");
+    let trackers: serde_json::Value = serde_json::from_slice(&body)?;
+    Ok(trackers["ports"][0]["address"].as_str().context("the port is listed")?.to_owned())
+}
+
+fn sources_are_listed_and_told_from_the_page() -> Result<()> {
+    let program = rhytid_tests::program("rhytid-server")?;
+    let work = tempfile::tempdir()?;
+    let server = Server::with(|config| {
+        config.listen_udp = vec!["livelink=127.0.0.1:0,room=stage,slot=phone,priority=60".parse().expect("a port for trackers")];
+        config.profiles = Some(work.path().join("profiles"));
+    });
+    let port = tracker_port(&server)?;
+    script("sources.mjs", Some(&server), &[("RHYTID_SERVER", &program), ("RHYTID_UDP", Path::new(&port)), ("RHYTID_WORK", work.path())])
+}
+
+fn a_newcomers_way() -> Result<()> {
+    let program = rhytid_tests::program("rhytid-server")?;
+    let server = Server::with(|config| config.listen_udp = vec!["openseeface=127.0.0.1:0,room=demo".parse().expect("a port for trackers")]);
+    let port = tracker_port(&server)?;
+    let feed = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/assets/demo.ibug68.jsonl");
+    script(
+        "newcomer.mjs",
+        Some(&server),
+        &[("RHYTID_CLIP", &film()), ("RHYTID_SERVER", &program), ("RHYTID_UDP", Path::new(&port)), ("RHYTID_FEED", &feed)],
+    )
 }
 
 fn the_page_survives_the_server() -> Result<()> {

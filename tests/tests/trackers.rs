@@ -579,6 +579,7 @@ fn a_recording_of_live_link_face_is_a_feed() {
         profile: None,
         timeout: Duration::from_secs(10),
         trust: Trust::Public,
+        token: None,
     };
     let sender = std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

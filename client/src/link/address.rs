@@ -44,6 +44,12 @@ impl ServerAddress {
         self.is_encrypted
     }
 
+    /// Nobody else can read what goes there.
+    pub(super) fn may_carry_secrets(&self) -> bool {
+        let is_here = self.host_and_port().0.parse::<std::net::IpAddr>().is_ok_and(|address| address.is_loopback());
+        self.is_encrypted || is_here || self.host == "localhost"
+    }
+
     /// As `ToSocketAddrs` wants it: IPv6 without its brackets.
     pub(super) fn host_and_port(&self) -> (&str, u16) {
         (self.host.trim_start_matches('[').trim_end_matches(']'), self.port)

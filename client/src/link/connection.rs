@@ -85,7 +85,13 @@ fn connect(options: &LinkOptions) -> Result<WebSocket<Wire>, Ended> {
 
     let uri = options.server.view_uri(&options.room);
     let uri = uri.parse().map_err(|error| Ended::Refused(format!("{uri} is no address: {error}")))?;
-    let request = ClientRequestBuilder::new(uri).with_sub_protocol(SUBPROTOCOL);
+    let mut request = ClientRequestBuilder::new(uri).with_sub_protocol(SUBPROTOCOL);
+    if let Some(token) = &options.token {
+        if !options.server.may_carry_secrets() {
+            return Err(Ended::Refused("a token goes over wss:// only, or to this machine: others on the way could read it".into()));
+        }
+        request = request.with_header("Authorization", format!("Bearer {token}"));
+    }
     let config =
         WebSocketConfig::default().read_buffer_size(READ_BUFFER).max_message_size(Some(MAX_MESSAGE)).max_frame_size(Some(MAX_MESSAGE));
     let (socket, _) = tungstenite::client::client_with_config(request, stream, Some(config)).map_err(|error| match error {

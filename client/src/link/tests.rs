@@ -3,7 +3,7 @@
 #![allow(clippy::result_large_err, reason = "tungstenite's callbacks are declared so")]
 
 use super::*;
-use crate::spectator::{Spectator, Status, StatusKind, WatchArgs};
+use crate::spectator::{Spectator, Status, StatusKind, TokenArgs, WatchArgs};
 use rhytid_shared::packet::{Encoder, PacketLayout};
 use rhytid_shared::trust::Trust;
 use rhytid_shared::view::{BoneHello, CharacterHello, PROTOCOL_VERSION, PoseHello, SUBPROTOCOL, ViewMessage};
@@ -29,7 +29,13 @@ impl TestServer {
 
     fn options(&self, known_sha256: &str) -> LinkOptions {
         let server = format!("ws://{}", self.listener.local_addr().unwrap()).parse().unwrap();
-        LinkOptions { server, room: RoomName::new("demo").unwrap(), trust: Trust::Public, known_sha256: Some(known_sha256.to_owned()) }
+        LinkOptions {
+            server,
+            room: RoomName::new("demo").unwrap(),
+            trust: Trust::Public,
+            token: None,
+            known_sha256: Some(known_sha256.to_owned()),
+        }
     }
 
     /// The next connection, which must ask for the room's socket with the subprotocol.
@@ -342,7 +348,12 @@ fn character_elsewhere_is_not_fetched() {
 fn watch(server: &TestServer) -> (Spectator, Socket) {
     let character = two_bones();
     let spectator = Spectator::open(
-        WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap(), trust: Trust::Public },
+        WatchArgs {
+            server: server.options("").server,
+            room: RoomName::new("demo").unwrap(),
+            trust: Trust::Public,
+            token: TokenArgs::default(),
+        },
         Arc::new(character),
         || (),
     );
@@ -418,7 +429,12 @@ fn status_says_that_the_server_is_gone_and_when_it_is_back() {
 #[test]
 fn status_tells_attempts_in_vain_and_refusals() {
     let server = TestServer::start();
-    let watched = WatchArgs { server: server.options("").server, room: RoomName::new("demo").unwrap(), trust: Trust::Public };
+    let watched = WatchArgs {
+        server: server.options("").server,
+        room: RoomName::new("demo").unwrap(),
+        trust: Trust::Public,
+        token: TokenArgs::default(),
+    };
     let mut spectator = Spectator::open(watched.clone(), Arc::new(two_bones()), || ());
     assert_eq!(spectator.status(Instant::now()).kind, StatusKind::Connecting);
     server.accept_with(|_, _| {

@@ -296,7 +296,8 @@ fn truth(captured_at: i64) -> f32 {
     (0.5 - 0.5 * phase.cos()) as f32
 }
 
-fn simulate(weather: Weather, seconds: i64, seed: u64) -> Seen {
+/// When which frames arrive, in order of arrival; `value` is the face by the time of its capture.
+fn arrivals(weather: Weather, seconds: i64, seed: u64, value: impl Fn(i64) -> f32) -> Vec<(i64, FaceFrame)> {
     let mut state = seed;
     let mut random = move || {
         // splitmix64
@@ -323,14 +324,18 @@ fn simulate(weather: Weather, seconds: i64, seed: u64) -> Seen {
             arrives = arrives.max(last);
         }
         last = last.max(arrives);
-        let frame = face(1, k as u32, captured_at, truth(captured_at));
+        let frame = face(1, k as u32, captured_at, value(captured_at));
         if weather.repeat_one_in > 0 && random().is_multiple_of(weather.repeat_one_in) {
             arrivals.push((arrives + 1, frame.clone()));
         }
         arrivals.push((arrives, frame));
     }
     arrivals.sort_by_key(|(at, _)| *at);
+    arrivals
+}
 
+fn simulate(weather: Weather, seconds: i64, seed: u64) -> Seen {
+    let arrivals = arrivals(weather, seconds, seed, truth);
     let mut playout = playout();
     let mut arrivals = arrivals.into_iter().peekable();
     let mut seen = Seen { worst_error: 0.0, worst_step: 0.0, pace: [f64::MAX, f64::MIN], stats: PlayoutStats::default() };
@@ -449,6 +454,43 @@ proptest! {
         prop_assert!((0.949..=1.051).contains(&seen.pace[0]) && seen.pace[1] <= 1.051, "{seen:?}");
         prop_assert!((40..=500).contains(&seen.stats.delay.as_millis()), "{seen:?}");
         prop_assert!(seen.worst_step < 0.35, "{seen:?}");
+    }
+
+    #[test]
+    fn face_that_only_rises_is_never_seen_to_fall_and_ends_on_its_last_frame(
+        fps in 10.0..120.0_f64, jitter in 0..150_i64, stall in 0..600_i64, repeat_one_in in 0..6_u64,
+        breaks_at in 2000..7000_i64, away in 0..1000_i64, seed: u64,
+    ) {
+        let weather = Weather { jitter, stall_every: 2500, stall, repeat_one_in, fps, ..FAIR };
+        // It rises for eight seconds and then stays as it is.
+        let mut arrivals = arrivals(weather, 10, seed, |captured_at| (captured_at as f32 / (8000 * MS) as f32).min(1.0)).into_iter().peekable();
+        let mut playout = playout();
+        // What is under way when the connection breaks is lost, and what comes before the next one stands.
+        let (breaks, back) = (breaks_at * MS, (breaks_at + away) * MS);
+        let (mut is_back, mut newest_lost) = (false, None);
+        let (mut before, mut highest) = (0.0_f32, 0.0_f32);
+        for now in (0..10_000 * MS).step_by(1_000_000 / 60) {
+            while let Some((at, frame)) = arrivals.next_if(|(at, _)| *at <= now) {
+                let at_viewer = Duration::from_micros(at.unsigned_abs());
+                if (breaks..back).contains(&at) {
+                    newest_lost = Some(frame);
+                    continue;
+                }
+                if at >= back && !std::mem::replace(&mut is_back, true) {
+                    // A new connection begins with the newest state.
+                    playout.reconnected(at_viewer);
+                    newest_lost.take().map(|frame| playout.push(&frame, at_viewer));
+                }
+                playout.push(&frame, at_viewer);
+            }
+            let value = x(playout.sample(Duration::from_micros(now.unsigned_abs())));
+            // Easing to neutral in silence shows no frame.
+            let is_eased = matches!(playout.state(), PlayoutState::Silent | PlayoutState::Idle);
+            prop_assert!(is_eased || value >= before - 1e-5, "{value} after {before} at {now}: {weather:?}");
+            before = value;
+            highest = highest.max(value);
+        }
+        prop_assert!((highest - 1.0).abs() < 1e-5, "it ends on {highest}: {weather:?}");
     }
 
     #[test]

@@ -17,12 +17,18 @@ pub struct Camera {
     pub distance: f32,
     /// Vertical field of view, radians.
     pub fovy: f32,
+    /// Nearest it is brought to the target, metres: outside the head, so that no part of it is cut open.
+    pub nearest: f32,
 }
 
 /// Steepest pitch: the view matrix degenerates at a right angle.
 const MAX_PITCH: f32 = 1.5;
-/// Nearest and farthest the eye may come, metres.
-const DISTANCE_RANGE: [f32; 2] = [0.15, 4.0];
+/// Farthest the eye may go, metres.
+const FARTHEST: f32 = 4.0;
+/// Radius of the head about the target in units of the farthest landmark's distance: the back of the head has none.
+const HEAD_IN_LANDMARKS: f32 = 1.25;
+/// Radians it turns for a drag over the height of the picture.
+const ORBIT_PER_HEIGHT: f32 = 3.5;
 /// Clip planes, metres: nothing of a bust is nearer or farther than that.
 const NEAR: f32 = 0.05;
 const FAR: f32 = 6.0;
@@ -42,7 +48,22 @@ impl Camera {
         let target = Vec3::new(0.5 * (marks[36].x + marks[45].x), chin.y + 0.62 * face_height, character.head_pivot.z);
         let height = PICTURE_HEIGHT_IN_FACES * face_height;
         let depth_of_face = brows.z - target.z;
-        Self { target, yaw: 0.0, pitch: 0.0, distance: depth_of_face + 0.5 * height / (0.5 * PORTRAIT_FOVY).tan(), fovy: PORTRAIT_FOVY }
+        let farthest_mark = marks.iter().map(|mark| mark.distance(target)).fold(0.0, f32::max);
+        Self {
+            target,
+            yaw: 0.0,
+            pitch: 0.0,
+            distance: depth_of_face + 0.5 * height / (0.5 * PORTRAIT_FOVY).tan(),
+            fovy: PORTRAIT_FOVY,
+            nearest: NEAR + HEAD_IN_LANDMARKS * farthest_mark,
+        }
+    }
+
+    /// Turned by a drag of the pointer, right and down, in a picture `height` high in the same unit. The face follows the
+    /// pointer: the camera goes the other way.
+    pub fn drag(&mut self, [right, down]: [f32; 2], height: f32) {
+        let turn = ORBIT_PER_HEIGHT / height.max(1.0);
+        self.orbit(-right * turn, down * turn);
     }
 
     /// Turned about the target, radians; the pitch stops short of the poles.
@@ -53,7 +74,7 @@ impl Camera {
 
     /// Brought nearer (`factor` < 1) or farther.
     pub fn zoom(&mut self, factor: f32) {
-        self.distance = (self.distance * factor).clamp(DISTANCE_RANGE[0], DISTANCE_RANGE[1]);
+        self.distance = (self.distance * factor).max(self.nearest).min(FARTHEST);
     }
 
     /// Where the camera stands, world space.
@@ -81,7 +102,7 @@ mod tests {
     use super::*;
 
     fn camera() -> Camera {
-        Camera { target: Vec3::new(0.0, 1.5, 0.0), yaw: 0.0, pitch: 0.0, distance: 1.0, fovy: 0.4 }
+        Camera { target: Vec3::new(0.0, 1.5, 0.0), yaw: 0.0, pitch: 0.0, distance: 1.0, fovy: 0.4, nearest: 0.2 }
     }
 
     #[test]
@@ -106,6 +127,32 @@ mod tests {
             let fade = camera.wrinkle_fade(0.006, 1080);
             assert!((fade - expected).abs() < 2e-5, "{distance} m: {fade}");
         }
+    }
+
+    #[test]
+    fn eye_stays_outside_the_head_from_every_side() {
+        let asset = crate::CharacterAsset::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).expect("the built-in character is whole");
+        let mut camera = Camera::front(&asset.character);
+        camera.zoom(1e-6);
+        let chin = asset.character.ibug68[8].y;
+        let vertices = asset.primitives.iter().flat_map(|primitive| &primitive.vertices).map(|vertex| Vec3::from(vertex.position));
+        let head = vertices.filter(|at| at.y > chin).map(|at| at.distance(camera.target)).fold(0.0, f32::max);
+        assert!(camera.distance >= head + NEAR, "{} m away, the head reaches {head} m", camera.distance);
+        assert!(camera.distance < 1.6 * head + NEAR, "{} m away, the head reaches only {head} m", camera.distance);
+        for _ in 0..3 {
+            camera.zoom(0.5);
+            assert_eq!(camera.distance, camera.nearest);
+        }
+        camera.zoom(1e6);
+        assert_eq!(camera.distance, FARTHEST);
+    }
+
+    #[test]
+    fn face_follows_a_drag() {
+        let mut camera = camera();
+        camera.drag([10.0, 0.0], 100.0);
+        // Seen from its right, the face has turned to the right of the picture.
+        assert!(camera.eye().x < 0.0, "{}", camera.eye());
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use super::device::{optional_features, required_limits};
 use super::picture_texture::picture_texture;
 use super::read_back::read_back;
-use super::{DrawSettings, Pass, PassTimer, RenderFrame, Renderer};
+use super::{DrawSettings, MapPool, Pass, PassTimer, RenderFrame, Renderer};
 use crate::asset::CharacterAsset;
 use image::RgbaImage;
 
@@ -58,6 +58,7 @@ pub struct Headless {
     adapter: wgpu::AdapterInfo,
     device: wgpu::Device,
     queue: wgpu::Queue,
+    pool: MapPool,
     renderer: Renderer,
 }
 
@@ -73,8 +74,15 @@ impl Headless {
     /// Opens the adapter asked for and uploads the character.
     pub fn on(asset: &CharacterAsset, choice: AdapterChoice) -> Result<Self, RenderError> {
         let (adapter, device, queue) = pollster::block_on(open_device(choice))?;
-        let renderer = Renderer::new(&device, &queue, asset, FORMAT);
-        Ok(Self { adapter, device, queue, renderer })
+        let pool = MapPool::new();
+        let renderer = Renderer::new(&device, &queue, &pool, asset, FORMAT);
+        Ok(Self { adapter, device, queue, pool, renderer })
+    }
+
+    /// Another character on the same device; maps that both have are there once.
+    pub fn beside(&self, asset: &CharacterAsset) -> Self {
+        let renderer = Renderer::new(&self.device, &self.queue, &self.pool, asset, FORMAT);
+        Self { adapter: self.adapter.clone(), device: self.device.clone(), queue: self.queue.clone(), pool: self.pool.clone(), renderer }
     }
 
     /// What draws.
@@ -85,6 +93,11 @@ impl Headless {
     /// The device, for who draws more than pictures.
     pub fn device(&self) -> (&wgpu::Device, &wgpu::Queue) {
         (&self.device, &self.queue)
+    }
+
+    /// The maps of all characters on the device.
+    pub fn pool(&self) -> &MapPool {
+        &self.pool
     }
 
     /// Draws one picture and waits for it.
@@ -147,9 +160,14 @@ impl Headless {
         self.renderer.num_draws()
     }
 
-    /// Bytes of buffers and textures the renderer holds on the device.
+    /// Bytes of buffers and textures the renderer uses on the device, shared ones included.
     pub fn gpu_bytes(&self) -> u64 {
         self.renderer.gpu_bytes()
+    }
+
+    /// Of those, bytes of maps that another character on the device uses as well.
+    pub fn shared_bytes(&self) -> u64 {
+        self.renderer.shared_bytes()
     }
 
     fn target(&self, size: [u32; 2]) -> Result<wgpu::Texture, RenderError> {

@@ -46,6 +46,10 @@ pub struct Frame {
     pub mouth_shape: [f32; 4],
     /// Centres, head space, left and right; w: radius.
     pub eyeballs: [[f32; 4]; 2],
+    /// Where the lids meet, from the centre of each ball, in radii: x and y of the corner of lower x, then of the other.
+    pub lid_corners: [[f32; 4]; 2],
+    /// How high the lids' edges arch over the line between the corners, in radii: upper and lower, left eye and right.
+    pub lid_arches: [f32; 4],
     /// Where the eyes look, world space.
     pub gazes: [[f32; 4]; 2],
     /// How fast light dies in flesh (1/mm), highlights, roughness, how much light leaks through: all multipliers.
@@ -71,6 +75,8 @@ assert_layout!(Frame, frame, {
     mouth: MOUTH,
     mouth_shape: MOUTH_SHAPE,
     eyeballs: EYEBALLS,
+    lid_corners: LID_CORNERS,
+    lid_arches: LID_ARCHES,
     gazes: GAZES,
     skin: SKIN,
     blood: BLOOD,

@@ -3,11 +3,13 @@
 use super::blood;
 use super::coefficients::pose_table;
 use super::layouts::Layouts;
+use super::map_pool::{MapKey, MapPool, PooledMap};
 use super::regions::{self, Region};
 use super::uniforms;
 use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, Morphs, PrimitiveAsset, Surface, Texels};
 use std::borrow::Cow;
 use std::collections::BTreeSet;
+use std::sync::Arc;
 use wgpu::util::DeviceExt;
 
 /// Sides of a texel's footprint that are sampled at most: skin is seen at grazing angles all round its outline.
@@ -20,7 +22,11 @@ const MORPH_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;
 pub struct Uploader<'a> {
     pub device: &'a wgpu::Device,
     pub queue: &'a wgpu::Queue,
-    /// Bytes created so far.
+    /// Maps of this and other characters on the device.
+    pub pool: &'a MapPool,
+    /// Maps used so far, each once.
+    pub maps: Vec<Arc<PooledMap>>,
+    /// Bytes used so far, those of maps that were there already as well.
     pub bytes: u64,
 }
 
@@ -55,7 +61,11 @@ pub struct CharacterGroup {
     pub group: wgpu::BindGroup,
 }
 
-impl Uploader<'_> {
+impl<'a> Uploader<'a> {
+    pub fn new(device: &'a wgpu::Device, queue: &'a wgpu::Queue, pool: &'a MapPool) -> Self {
+        Self { device, queue, pool, maps: Vec::new(), bytes: 0 }
+    }
+
     pub fn uniform(&mut self, label: &str, size: usize) -> wgpu::Buffer {
         self.bytes += size as u64;
         self.device.create_buffer(&wgpu::BufferDescriptor {
@@ -122,45 +132,56 @@ impl Uploader<'_> {
         label: &str,
         layers: &[&MipChain],
         format: wgpu::TextureFormat,
-        encoded: impl for<'a> Fn(&'a MipChain, usize, [u32; 2]) -> Cow<'a, [u8]>,
+        encoded: impl for<'c> Fn(&'c MipChain, usize, [u32; 2]) -> Cow<'c, [u8]>,
     ) -> wgpu::Texture {
         let most = self.device.limits().max_texture_dimension_2d;
         let first = layers[0];
         let side_at = |level: usize, axis: usize| (first.size[axis] >> level).max(1);
         let skipped = (0..first.levels.len()).find(|&level| side_at(level, 0).max(side_at(level, 1)) <= most).unwrap_or(0);
-        let texture = self.device.create_texture(&wgpu::TextureDescriptor {
-            label: Some(label),
-            size: wgpu::Extent3d { width: side_at(skipped, 0), height: side_at(skipped, 1), depth_or_array_layers: layers.len() as u32 },
-            mip_level_count: (first.levels.len() - skipped) as u32,
-            sample_count: 1,
-            dimension: wgpu::TextureDimension::D2,
-            format,
-            usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
-            view_formats: &[],
-        });
-        let (block_width, _) = format.block_dimensions();
-        let block_bytes = format.block_copy_size(None).unwrap_or(4);
-        for (layer, chain) in layers.iter().enumerate() {
-            for level in skipped..chain.levels.len() {
-                let size = wgpu::Extent3d { width: side_at(level, 0), height: side_at(level, 1), depth_or_array_layers: 1 };
-                let bytes = encoded(chain, level, [size.width, size.height]);
-                self.queue.write_texture(
-                    wgpu::TexelCopyTextureInfo {
-                        texture: &texture,
-                        mip_level: (level - skipped) as u32,
-                        origin: wgpu::Origin3d { x: 0, y: 0, z: layer as u32 },
-                        aspect: wgpu::TextureAspect::All,
-                    },
-                    &bytes,
-                    wgpu::TexelCopyBufferLayout {
-                        offset: 0,
-                        bytes_per_row: Some(size.width.div_ceil(block_width) * block_bytes),
-                        rows_per_image: None,
-                    },
-                    size.physical_size(format),
-                );
-                self.bytes += bytes.len() as u64;
+        let size = wgpu::Extent3d { width: side_at(skipped, 0), height: side_at(skipped, 1), depth_or_array_layers: layers.len() as u32 };
+        let num_levels = (first.levels.len() - skipped) as u32;
+        let texels = layers.iter().flat_map(|chain| &chain.levels[skipped..]).map(Vec::as_slice);
+        let key = MapKey::new(format, size, num_levels, texels);
+        let (device, queue) = (self.device, self.queue);
+        self.pooled(key, || {
+            let texture = device.create_texture(&map_descriptor(label, size, num_levels, format));
+            let (block_width, _) = format.block_dimensions();
+            let block_bytes = format.block_copy_size(None).unwrap_or(4);
+            let mut num_bytes = 0;
+            for (layer, chain) in layers.iter().enumerate() {
+                for level in skipped..chain.levels.len() {
+                    let size = wgpu::Extent3d { width: side_at(level, 0), height: side_at(level, 1), depth_or_array_layers: 1 };
+                    let bytes = encoded(chain, level, [size.width, size.height]);
+                    queue.write_texture(
+                        wgpu::TexelCopyTextureInfo {
+                            texture: &texture,
+                            mip_level: (level - skipped) as u32,
+                            origin: wgpu::Origin3d { x: 0, y: 0, z: layer as u32 },
+                            aspect: wgpu::TextureAspect::All,
+                        },
+                        &bytes,
+                        wgpu::TexelCopyBufferLayout {
+                            offset: 0,
+                            bytes_per_row: Some(size.width.div_ceil(block_width) * block_bytes),
+                            rows_per_image: None,
+                        },
+                        size.physical_size(format),
+                    );
+                    num_bytes += bytes.len() as u64;
+                }
             }
+            (texture, num_bytes)
+        })
+    }
+
+    /// The map of `key`, made only if no character on the device has it.
+    fn pooled(&mut self, key: MapKey, make: impl FnOnce() -> (wgpu::Texture, u64)) -> wgpu::Texture {
+        let map = self.pool.map_of(key, make);
+        let texture = map.texture.clone();
+        // Two materials of one character may share a map as well.
+        if !self.maps.iter().any(|known| Arc::ptr_eq(known, &map)) {
+            self.bytes += map.bytes;
+            self.maps.push(map);
         }
         texture
     }
@@ -246,22 +267,14 @@ impl Uploader<'_> {
         let [width, height] = morphs.texture_size();
         let mut texels = morphs.texels.clone();
         texels.resize((width * height) as usize, [half::f16::ZERO; 4]);
-        self.bytes += size_of_val(texels.as_slice()) as u64;
-        let texture = self.device.create_texture_with_data(
-            self.queue,
-            &wgpu::TextureDescriptor {
-                label: Some("morph deltas"),
-                size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
-                mip_level_count: 1,
-                sample_count: 1,
-                dimension: wgpu::TextureDimension::D2,
-                format: MORPH_FORMAT,
-                usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
-                view_formats: &[],
-            },
-            wgpu::util::TextureDataOrder::LayerMajor,
-            bytemuck::cast_slice(&texels),
-        );
+        let bytes: &[u8] = bytemuck::cast_slice(&texels);
+        let size = wgpu::Extent3d { width, height, depth_or_array_layers: 1 };
+        let (device, queue) = (self.device, self.queue);
+        let texture = self.pooled(MapKey::new(MORPH_FORMAT, size, 1, [bytes]), || {
+            let descriptor = map_descriptor("morph deltas", size, 1, MORPH_FORMAT);
+            let texture = device.create_texture_with_data(queue, &descriptor, wgpu::util::TextureDataOrder::LayerMajor, bytes);
+            (texture, bytes.len() as u64)
+        });
         texture.create_view(&wgpu::TextureViewDescriptor::default())
     }
 
@@ -331,6 +344,20 @@ impl Uploader<'_> {
             anisotropy_clamp: if is_software { 1 } else { ANISOTROPY },
             ..Default::default()
         })
+    }
+}
+
+/// A map to read from, filled once.
+fn map_descriptor(label: &str, size: wgpu::Extent3d, mip_level_count: u32, format: wgpu::TextureFormat) -> wgpu::TextureDescriptor<'_> {
+    wgpu::TextureDescriptor {
+        label: Some(label),
+        size,
+        mip_level_count,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format,
+        usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+        view_formats: &[],
     }
 }
 

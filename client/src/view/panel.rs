@@ -2,10 +2,10 @@
 
 use super::look::{self, ACCENT, BAD, FAINT, GOOD, PANEL, TEXT, WARN, WELL};
 use super::pages;
-use super::rates::Rate;
 use super::switches::{Page, Switches, views};
 use crate::link::LinkStats;
 use crate::playout::PlayoutStats;
+use crate::rate::Rate;
 use crate::renderer::{BlendMode, Deformation, RenderFrame, ViewMode};
 use crate::spectator::{Status, StatusKind};
 use egui::{Align2, Color32, CornerRadius, FontId, Frame, Margin, Pos2, Rect, RichText, Sense, Ui, pos2, vec2};
@@ -28,6 +28,8 @@ pub(crate) struct Scene<'a> {
     pub(crate) link: LinkStats,
     pub(crate) playout: PlayoutStats,
     pub(crate) rates: &'a Rates,
+    /// The rates' clock.
+    pub(crate) since_opened: std::time::Duration,
     /// Bytes of the zones' masks and of their wrinkle map on the device.
     pub(crate) zone_bytes: u64,
     /// What draws.
@@ -251,7 +253,7 @@ fn deformation_switches(ui: &mut Ui, scene: &Scene<'_>, switches: &mut Switches)
 
 fn numbers(ui: &mut Ui, scene: &Scene<'_>) {
     let millis = |time: std::time::Duration| format!("{:.0} ms", time.as_secs_f64() * 1e3);
-    let (link, playout, rates) = (&scene.link, &scene.playout, scene.rates);
+    let (link, playout, rates, now) = (&scene.link, &scene.playout, scene.rates, scene.since_opened);
     // Half the way there and back, and what playout adds; the sender's own clock cannot be compared with ours.
     let latency = link.round_trip.map_or_else(|| "–".into(), |way| millis(way / 2 + playout.delay));
     let packets = format!("Frame packets received a second; the sender makes one every {}", millis(playout.send_interval));
@@ -259,11 +261,11 @@ fn numbers(ui: &mut Ui, scene: &Scene<'_>) {
         format!("Playout delay: how much later than possible the face is shown, so that it moves evenly; {} frames wait", playout.buffered);
     let jitter = format!("95 % of packets are late by no more than this; {} times none was there in time", playout.underruns);
     let numbers = [
-        ("Pictures", a_second(rates.pictures.per_second()), "Pictures drawn a second"),
+        ("Pictures", a_second(rates.pictures.per_second(now)), "Pictures drawn a second"),
         ("Latency", latency, "Server to screen: half a round trip and the playout delay"),
-        ("Packets", a_second(rates.packets.per_second()), &packets),
+        ("Packets", a_second(rates.packets.per_second(now)), &packets),
         ("Delay", millis(playout.delay), &delay),
-        ("Bytes", bytes_a_second(rates.bytes.per_second()), "Payload of frame packets a second"),
+        ("Bytes", bytes_a_second(rates.bytes.per_second(now)), "Payload of frame packets a second"),
         ("Jitter", millis(playout.jitter), &jitter),
     ];
     let gap = 20.0;

@@ -45,8 +45,6 @@ impl Page {
         [(Self::Face, "Face"), (Self::Hand, "Hand"), (Self::Zones, "Zones"), (Self::Light, "Light"), (Self::Skin, "Skin")];
 }
 
-/// Radians the camera turns for a drag over the height of the picture.
-const ORBIT_PER_HEIGHT: f32 = 3.5;
 /// Share by which one notch (50 points) of the wheel brings the camera nearer.
 const ZOOM_PER_POINT: f32 = 0.002;
 
@@ -150,9 +148,7 @@ impl Switches {
 
     /// Turns the camera by a drag of `points` in a picture `height` points high.
     pub(crate) fn drag(&mut self, points: egui::Vec2, height: f32) {
-        let turn = points * ORBIT_PER_HEIGHT / height.max(1.0);
-        // The face follows the pointer: the camera goes the other way.
-        self.draw.camera.orbit(-turn.x, turn.y);
+        self.draw.camera.drag([points.x, points.y], height);
     }
 
     /// Brings the camera nearer (`points` > 0) or farther.

@@ -6,7 +6,7 @@ use super::painter::Painter;
 use super::panel::{self, Scene};
 use super::switches::Switches;
 use crate::asset::CharacterAsset;
-use crate::renderer::{RenderError, RenderFrame, Renderer, optional_features, picture_texture, read_back, required_limits};
+use crate::renderer::{MapPool, RenderError, RenderFrame, Renderer, optional_features, picture_texture, read_back, required_limits};
 use image::RgbaImage;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -34,6 +34,7 @@ pub(super) struct GpuWindow {
     is_software: bool,
     device: wgpu::Device,
     queue: wgpu::Queue,
+    pool: MapPool,
     renderer: Renderer,
     face: FaceTexture,
     egui: egui_winit::State,
@@ -106,7 +107,8 @@ impl GpuWindow {
             Some(device.limits().max_texture_dimension_2d as usize),
         );
         let mut painter = Painter::new(&device, surface_config.format);
-        let renderer = Renderer::new(&device, &queue, asset, FACE_FORMAT);
+        let pool = MapPool::new();
+        let renderer = Renderer::new(&device, &queue, &pool, asset, FACE_FORMAT);
         let face = FaceTexture::new(&device, &mut painter, [1, 1], None);
         Ok(Self {
             surface,
@@ -120,6 +122,7 @@ impl GpuWindow {
             adapter_name: info.name,
             device,
             queue,
+            pool,
             renderer,
             face,
             egui,
@@ -160,7 +163,8 @@ impl GpuWindow {
 
     /// Draws another character from now on.
     pub(super) fn change_character(&mut self, asset: &CharacterAsset) {
-        self.renderer = Renderer::new(&self.device, &self.queue, asset, FACE_FORMAT);
+        // The old one goes after the new one has come, so that maps which both have stay.
+        self.renderer = Renderer::new(&self.device, &self.queue, &self.pool, asset, FACE_FORMAT);
     }
 
     /// What draws.

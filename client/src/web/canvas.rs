@@ -1,7 +1,7 @@
 //! The canvas's GPU side: surface, device, renderer.
 
 use crate::asset::CharacterAsset;
-use crate::renderer::{DrawSettings, RenderFrame, Renderer, required_limits};
+use crate::renderer::{DrawSettings, MapPool, RenderFrame, Renderer, required_limits};
 use rhytid_shared::Character;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -30,6 +30,7 @@ pub(super) struct Canvas {
     queue: wgpu::Queue,
     adapter: String,
     backend: &'static str,
+    pool: MapPool,
     renderer: Option<Renderer>,
     /// Set when the device is gone or something drawn was refused.
     failure: Arc<Mutex<Option<String>>>,
@@ -101,6 +102,7 @@ impl Canvas {
             queue,
             adapter: info.name,
             backend: if info.backend == wgpu::Backend::BrowserWebGpu { "WebGPU" } else { "WebGL2" },
+            pool: MapPool::new(),
             renderer: None,
             failure,
         })
@@ -131,9 +133,10 @@ impl Canvas {
     }
 
     pub fn upload(&mut self, asset: &CharacterAsset) {
-        // The old character's memory first.
-        self.renderer = None;
-        self.renderer = Some(Renderer::new(&self.device, &self.queue, asset, self.view_format));
+        // The old character's memory first, but for the maps, which the new one may have as well.
+        let kept = self.renderer.take().map(Renderer::into_maps);
+        self.renderer = Some(Renderer::new(&self.device, &self.queue, &self.pool, asset, self.view_format));
+        drop(kept);
     }
 
     pub fn resize(&mut self, width: u32, height: u32) {

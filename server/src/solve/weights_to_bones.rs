@@ -3,6 +3,7 @@
 
 use super::lids::gaze_share;
 use super::linear::Lu;
+use super::lips::Lips;
 use super::rotation;
 use glam::Vec3;
 use rhytid_shared::character::{Drive, LidKind, Side};
@@ -25,9 +26,9 @@ pub(super) type Weights = [f32; NUM_ARKIT_SHAPES];
 
 /// One shape's effect at weight 1: a motion for each bone.
 #[derive(Debug, Clone)]
-struct Response {
-    shape: usize,
-    motions: Vec<Vec3>,
+pub(super) struct Response {
+    pub(super) shape: usize,
+    pub(super) motions: Vec<Vec3>,
 }
 
 /// The map from weights to one character's bones.
@@ -38,6 +39,7 @@ pub(super) struct WeightRig {
     limits: Vec<Limit>,
     /// Squint and blink of each eye.
     lid_shapes: [[usize; 2]; 2],
+    lips: Lips,
     /// What lifts the lower lip against the upper one.
     lip_lifts: [usize; 2],
 }
@@ -71,7 +73,8 @@ impl WeightRig {
         let index = |name: &str| ARKIT_NAMES.iter().position(|known| *known == name).unwrap_or(0);
         let lid_shapes = [["eyeSquintLeft", "eyeBlinkLeft"], ["eyeSquintRight", "eyeBlinkRight"]].map(|pair| pair.map(index));
         let lip_lifts = ["mouthRollLower", "mouthShrugLower"].map(index);
-        let mut rig = Self { responses, correctives: None, limits, lid_shapes, lip_lifts };
+        let lips = Lips::new(character, &responses);
+        let mut rig = Self { responses, correctives: None, limits, lid_shapes, lips, lip_lifts };
         rig.correctives = Correctives::new(character, &rig);
         rig
     }
@@ -92,6 +95,7 @@ impl WeightRig {
         if let Some(correctives) = &self.correctives {
             correctives.add(&weights, motions);
         }
+        self.lips.add(&weights, motions);
         for (motion, limit) in motions.iter_mut().zip(&self.limits) {
             if let Limit::Angles(pitch, yaw) = limit {
                 *motion = Vec3::new(motion.x.clamp(pitch[0], pitch[1]), motion.y.clamp(-yaw, *yaw), 0.0);
@@ -198,6 +202,9 @@ struct Correctives {
     centres: Vec<f32>,
     /// `-1 / (2 sigma^2)`.
     falloff: f64,
+    /// `jawOpen` and `mouthClose` where no example says what the two do together: then a jaw parts the lips by what it exceeds the
+    /// mouth's closing alone.
+    closing: Option<[usize; 2]>,
     /// Each bell's value at neutral.
     at_neutral: Vec<f64>,
     /// `(bone, m amplitudes)`.
@@ -265,10 +272,16 @@ impl Correctives {
             .iter()
             .map(|centre| libm::exp(centre.iter().map(|&at| f64::from(0.0 - at) * f64::from(0.0 - at)).sum::<f64>() * falloff))
             .collect();
-        Some(Self { shapes, centres: centres.concat(), falloff, at_neutral, amplitudes })
+        let [jaw_open, mouth_close] = ["jawOpen", "mouthClose"].map(|name| ArkitShape::from_name(name).map(ArkitShape::index));
+        let closing = jaw_open.zip(mouth_close.filter(|close| !shapes.contains(close))).map(<[usize; 2]>::from);
+        Some(Self { shapes, centres: centres.concat(), falloff, closing, at_neutral, amplitudes })
     }
 
     fn add(&self, weights: &Weights, motions: &mut [Vec3]) {
+        let mut weights = *weights;
+        if let Some([jaw_open, mouth_close]) = self.closing {
+            weights[jaw_open] = (weights[jaw_open] - weights[mouth_close]).max(0.0);
+        }
         for (m, centre) in self.centres.chunks_exact(self.shapes.len()).enumerate() {
             let mut square = 0.0;
             for (&shape, &at) in self.shapes.iter().zip(centre) {

@@ -21,12 +21,19 @@ fn nearest_eye(head: vec3<f32>) -> u32 {
     return select(1u, 0u, distance(head, frame.eyeballs[0].xyz) < distance(head, frame.eyeballs[1].xyz));
 }
 
-// The lids shade the ball along their edge: it is darkest under the upper one, and in the corners.
-fn lid_light(offset: vec3<f32>) -> f32 {
-    let upper = smoothstep(-0.02, 0.52, offset.y);
-    let lower = smoothstep(-0.22, -0.60, offset.y);
+// The lids shade the ball along their edges, wherever these are just now: it is darkest under the upper one, which stands
+// off further and whose lashes shade it as well, and in the corners.
+fn lid_light(offset: vec3<f32>, which: u32) -> f32 {
+    let corners = frame.lid_corners[which];
+    let arches = select(frame.lid_arches.zw, frame.lid_arches.xy, which == 0u);
+    let t = clamp((offset.x - corners.x) / max(corners.z - corners.x, 1e-3), 0.0, 1.0);
+    let edges = mix(corners.y, corners.w, t) + arches * (4.0 * t * (1.0 - t));
+    let below_upper = edges.x - offset.y;
+    let upper = smoothstep(0.40, -0.14, below_upper);
+    let at_upper = smoothstep(0.13, 0.0, below_upper);
+    let lower = smoothstep(0.30, -0.08, offset.y - edges.y);
     let corner = smoothstep(0.38, 0.90, abs(offset.x));
-    return (1.0 - 0.70 * upper) * (1.0 - 0.35 * lower) * (1.0 - 0.50 * corner);
+    return (1.0 - 0.66 * upper) * (1.0 - 0.38 * at_upper) * (1.0 - 0.35 * lower) * (1.0 - 0.50 * corner);
 }
 
 // Light that the lids let through has come off skin: it is the warmer the less of it there is.
@@ -74,7 +81,7 @@ fn fs_bare(in: Varyings) -> Shaded {
         frame.head_from_world[0].z * turned.x + frame.head_from_world[1].z * turned.y + frame.head_from_world[2].z * turned.z,
     );
     let uv = uv_behind_cornea(in, normal, view, gaze, centre, ball.w);
-    let occlusion = lid_light(offset);
+    let occlusion = lid_light(offset, which);
     let shade = lid_colour(occlusion);
     let visible = key_visibility(in.world, normal);
     let albedo = albedo_of(uv).rgb;

@@ -30,6 +30,10 @@ struct Frame {
     mouth_shape: vec4<f32>,
     // Centres of the eyeballs in head space, left and right; w: radius.
     eyeballs: array<vec4<f32>, 2>,
+    // Where the lids meet, from the centre of each ball in head space, in radii: x and y of the one of lower x, then of the other.
+    lid_corners: array<vec4<f32>, 2>,
+    // How high their edges arch over the line between the corners just now, in radii: upper and lower of the left eye, of the right.
+    lid_arches: vec4<f32>,
     // Where they look: unit vectors, world space.
     gazes: array<vec4<f32>, 2>,
     // x: 1/mm, how fast light dies in the flesh (see transmittance). y: strength of highlights. z: roughness, multiplied.

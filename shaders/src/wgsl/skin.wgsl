@@ -23,6 +23,13 @@ fn with_blood(albedo: vec3<f32>, change: f32) -> vec3<f32> {
     return albedo * exp(-change * HAEMOGLOBIN);
 }
 
+// Lids are thin, but what shines through them goes on into the ball they lie on: 0 on the lids, 1 off them.
+fn off_the_eyes(rest: vec3<f32>) -> f32 {
+    let eyes = &frame.eyeballs;
+    let far = min(distance(rest, (*eyes)[0].xyz) / (*eyes)[0].w, distance(rest, (*eyes)[1].xyz) / (*eyes)[1].w);
+    return smoothstep(1.3, 2.4, far);
+}
+
 fn shade(in: Varyings, normal: vec3<f32>) -> Shaded {
     let blood = blood_change(in.uv);
     let albedo = with_blood(albedo_of(in.uv).rgb, blood);
@@ -52,7 +59,8 @@ fn shade(in: Varyings, normal: vec3<f32>) -> Shaded {
     let behind = clamp(0.3 - dot(smooth_normal, key.direction.xyz), 0.0, 1.0);
     var through = vec3<f32>(0.0);
     if behind > 0.0 && frame.skin.w > 0.0 {
-        through = key.radiance.rgb * transmittance(1000.0 * thickness(in.world, smooth_normal) * frame.skin.x) * behind * occlusion * frame.skin.w;
+        let flesh = 1000.0 * thickness(in.world, smooth_normal) * frame.skin.x;
+        through = key.radiance.rgb * transmittance(flesh) * (behind * occlusion * frame.skin.w * off_the_eyes(in.rest));
     }
     if frame.shown.x == SHOW_TRANSLUCENCY {
         return Shaded(vec4<f32>(0.0, 0.0, 0.0, 2.0), vec4<f32>(albedo * through, depth_of(in.world)));

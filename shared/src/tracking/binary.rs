@@ -12,7 +12,7 @@
 //! | … | count × u8 | confidence × 255, with bit 1 |
 
 use super::MessageError;
-use super::fields::MAX_PIXELS;
+use super::values::MAX_PIXELS;
 use crate::limits::MAX_FEATURE_POINTS;
 
 /// The only kind there is.

@@ -1,7 +1,8 @@
 //! One publish session's messages, checked in their order.
 
 use super::binary;
-use super::fields::{Fields, Kind, LayoutField, cut};
+use super::fields::{Fields, Kind, LayoutField};
+use super::values::cut;
 use super::{
     Command, FIT_SECONDS, FitRequest, FitStep, MessageError, PublishHello, PublishMessage, Settings, Slot, TrackingData, TrackingFrame,
 };
@@ -385,6 +386,16 @@ fn name_of(layout: &Layout) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_error_is_one_line_whatever_it_repeats() {
+        // Found by fuzzing: the name of the field came back as it was written.
+        let text = r#"{"type":"profile","profile":{"rhytid_profile":1,"r\nges\u001b[31m":{}}}"#;
+        let message = PublishReader::read_command(text).unwrap_err().message;
+        assert!(message.contains("ges") && !message.contains(char::is_control), "{message:?}");
+        let long = format!(r#"{{"type":"profile","profile":{{"rhytid_profile":1,"{}":{{}}}}}}"#, "é".repeat(100_000));
+        assert!(PublishReader::read_command(&long).unwrap_err().message.chars().count() <= 2001);
+    }
     use crate::testing::tiny_character;
     use glam::Vec3;
 

@@ -170,7 +170,9 @@ fn terms() -> Vec<(&'static str, Shot, Vec<Shot>)> {
     let zones = |face: Face| Shot { face, system: WrinkleSystem::Zones, lens: Lens::Forehead, ..REST };
     let by_zones = |name: &'static str, face: Face| {
         let bones = Shot { system: WrinkleSystem::Bones, ..zones(face) };
-        (name, zones(face), vec![weaker(&zones(face)), bones])
+        // Furrows between the brows are few and soft: a fifth less of them would hardly show.
+        let weaker = Shot { strength: 0.7, ..zones(face) };
+        (name, zones(face), vec![weaker, bones])
     };
     vec![
         term("term_diffuse", viewed("diffuse"), SkinSettings { scattering: 0.0, ..SKIN }),

@@ -9,6 +9,7 @@ mod morphs;
 mod probe;
 mod properties;
 mod read_back;
+mod sharing;
 mod skin;
 mod twins;
 mod views;
@@ -72,6 +73,7 @@ fn main() -> ExitCode {
     skin::add(&mut add);
     blood::add(&mut add);
     zones::add(&mut add);
+    sharing::add(&mut add);
     views::add(&mut add);
     properties::add(&mut add);
     golden::add(&mut add);

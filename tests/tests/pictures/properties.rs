@@ -204,7 +204,7 @@ fn targets_encode_alike(stage: &Stage) -> anyhow::Result<()> {
     for view in [ViewMode::Beauty, ViewMode::Normals, ViewMode::Split] {
         let settings = DrawSettings { view, ..DrawSettings::new(camera(&stage.asset.character, Lens::Face)) };
         let draw = |format: wgpu::TextureFormat| {
-            let mut renderer = Renderer::new(device, queue, &stage.asset, format);
+            let mut renderer = Renderer::new(device, queue, headless.pool(), &stage.asset, format);
             let target = picture_texture(device, "test picture", [SIDE; 2], format, wgpu::TextureUsages::COPY_SRC);
             let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("test picture") });
             let seen = target.create_view(&wgpu::TextureViewDescriptor::default());

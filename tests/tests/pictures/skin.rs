@@ -2,11 +2,14 @@
 
 use crate::probe::{PLACE, Probe, Resource, What, run, texture};
 use crate::{Add, Stage};
-use anyhow::ensure;
+use anyhow::{Context, ensure};
 use glam::{Vec3, Vec4};
 use rhytid_client::asset::{MipChain, Surface, Texels};
+use rhytid_client::render_cli::solve_one;
 use rhytid_client::renderer::{Term, scattering, uniforms};
 use rhytid_client::{Camera, DrawSettings, RenderFrame, ViewMode, twin};
+use rhytid_shared::character::{Drive, Side};
+use rhytid_shared::{ArkitShape, NUM_ARKIT_SHAPES, TrackingData};
 
 pub fn add(add: &mut Add<'_>) {
     add("skin::tone_map".into(), Box::new(tone_map));
@@ -14,6 +17,7 @@ pub fn add(add: &mut Add<'_>) {
     add("skin::intensity_of_every_code".into(), Box::new(intensity));
     add("skin::highlights_follow_the_map_of_intensity".into(), Box::new(mapped_intensity));
     add("skin::transmittance".into(), Box::new(transmittance));
+    add("skin::shadow_of_the_lid_follows_a_blink".into(), Box::new(shadow_of_the_lid));
     add("skin::scattering_spreads_light_along_the_surface_only".into(), Box::new(scattering_of_an_edge));
 }
 
@@ -155,6 +159,41 @@ fn transmittance(stage: &Stage) -> anyhow::Result<()> {
         let twin = twin::skin::transmittance(a[0]);
         ensure!(Vec4::from(got).truncate().distance(twin) < 1e-5, "{} mm: {got:?} on the device, {twin} in the twin", a[0]);
     }
+    Ok(())
+}
+
+/// The whites of both eyes, left and right, a little above their lower lids, while the left eye shuts by a share.
+fn shadow_of_the_lid(stage: &Stage) -> anyhow::Result<()> {
+    const SIDE: u32 = 256;
+    // On the outer side of the iris and below the ball's middle, metres.
+    const ASIDE: f32 = 0.008;
+    const BELOW: f32 = 0.003;
+    let character = &stage.asset.character;
+    let whites = |blink: f32| -> anyhow::Result<[f32; 2]> {
+        let mut weights = Box::new([0.0; NUM_ARKIT_SHAPES]);
+        weights[ArkitShape::from_name("eyeBlinkLeft").context("a shape")?.index()] = blink;
+        let frame = RenderFrame::from(&solve_one(character, TrackingData::Weights { weights, head: None })?);
+        let mut found = [0.0; 2];
+        for (found, (side, outwards)) in found.iter_mut().zip([(Side::Left, 1.0), (Side::Right, -1.0)]) {
+            let eye = character.bones.iter().find_map(|bone| match bone.drive {
+                Drive::Eye { eye, pivot, .. } if eye == side => Some((pivot, bone.rest.distance(pivot))),
+                _ => None,
+            });
+            let (centre, radius) = eye.context("the built-in character has eyes")?;
+            let ahead = (radius * radius - ASIDE * ASIDE - BELOW * BELOW).sqrt();
+            let at = centre + Vec3::new(ASIDE * outwards, -BELOW, ahead);
+            let camera = Camera { target: at, yaw: 0.0, pitch: 0.0, distance: 0.4, ..Camera::front(character) };
+            let settings = DrawSettings { view: ViewMode::Term(Term::Diffuse), ..DrawSettings::new(camera) };
+            let picture = stage.headless()?.render([SIDE; 2], &settings, &frame)?;
+            let middle = picture.get_pixel(SIDE / 2, SIDE / 2).0;
+            *found = f32::from(middle[1]);
+        }
+        Ok(found)
+    };
+    let [open, half] = [whites(0.0)?, whites(0.4)?];
+    ensure!(open[0] > 60.0, "no white at {open:?}");
+    ensure!(half[0] < 0.9 * open[0], "the lid comes down and the white below it stays at {} codes of {}", half[0], open[0]);
+    ensure!((half[1] - open[1]).abs() <= 1.0, "the other eye changes from {} to {}", open[1], half[1]);
     Ok(())
 }
 

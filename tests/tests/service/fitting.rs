@@ -169,6 +169,7 @@ fn somebody_else_fits_a_source_at_the_command_line_and_the_profile_is_sent_along
         ready: Duration::from_millis(400),
         hold: Duration::from_millis(400),
         trust: Trust::Public,
+        token: None,
     };
     let (face, is_over) = (Arc::new(Mutex::new("neutral")), Arc::new(AtomicBool::new(false)));
     let mut guide = Obedient { face: face.clone(), told: Vec::new() };
@@ -211,6 +212,7 @@ fn somebody_else_fits_a_source_at_the_command_line_and_the_profile_is_sent_along
         profile: Some(ProfileChoice::Given(Box::new(profile))),
         timeout: Duration::from_secs(10),
         trust: Trust::Public,
+        token: None,
     };
     block_on(send(&options, &indicatif::ProgressBar::hidden(), std::future::pending())).unwrap();
     watch_until(&mut viewer, |viewer| shape(viewer, "mouthLeft") > 0.9);

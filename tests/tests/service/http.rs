@@ -192,6 +192,7 @@ fn elsewhere_than_on_loopback_a_name_must_be_listed() {
     // A page elsewhere can make any name of its own point here, but no address.
     let server = Server::with(|config| {
         config.listen = "0.0.0.0:0".into();
+        config.access.insecure = true;
         config.access.hosts = vec!["faces.example".into()];
     });
     let port = server.address.port();

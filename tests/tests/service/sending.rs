@@ -28,6 +28,7 @@ fn options(server: &Server, text: String) -> SendOptions {
         profile: None,
         timeout: Duration::from_secs(15),
         trust: Trust::Public,
+        token: None,
     }
 }
 

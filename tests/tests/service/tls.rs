@@ -29,6 +29,7 @@ fn watch(server: &Server, host: &str, trust: Trust) -> LinkState {
         server: format!("wss://{host}:{}", server.address.port()).parse().unwrap(),
         room: RoomName::new("demo").unwrap(),
         trust,
+        token: None,
         known_sha256: None,
     };
     let link = Link::open(options, || ());
@@ -72,6 +73,7 @@ fn viewers_and_senders_trust_a_fingerprint_or_an_authority_and_nothing_else() {
         profile: None,
         timeout: Duration::from_secs(15),
         trust,
+        token: None,
     };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let send_now = |trust| {
@@ -91,6 +93,7 @@ fn a_certificate_that_changes_is_read_again_and_nobody_is_cut_off() {
         server: format!("wss://localhost:{}", server.address.port()).parse().unwrap(),
         room: RoomName::new("demo").unwrap(),
         trust: Trust::Fingerprint(first),
+        token: None,
         known_sha256: None,
     };
     let old = Link::open(options, || ());

@@ -16,10 +16,13 @@ pub struct Lids {
     pub points: [[Vec3; 2]; 2],
 }
 
-/// Angles about +X, degrees, that shut and that widen: `[upper, lower][shut, wide]`. The shape `eyeBlink` turns the
-/// middle of the upper lid by 44 degrees and its outer part by 50; the lower one it leaves.
-pub const LID_DEGREES: [[f32; 2]; 2] = [[SHUT_DEGREES, -9.0], [-3.0, 3.0]];
-const SHUT_DEGREES: f32 = 49.0;
+/// Angles about +X, degrees, that shut and that widen: `[upper, lower][shut, wide]`.
+pub const LID_DEGREES: [[f32; 2]; 2] = [[SHUT_DEGREES, -9.0], [-1.0, 3.0]];
+/// Turn of the upper lid whose share is 1. With that of the shape `eyeBlink` (the middle 44 degrees, the outer part 50)
+/// it would go on for 2 mm over the edge of the lower lid, whose lashes would stick out of it.
+const SHUT_DEGREES: f32 = 47.5;
+/// Turn in the shape that makes a share of 1.
+const SHAPE_DEGREES: f32 = 49.0;
 /// Skin stays this far from the ball, metres.
 const CLEARANCE: f32 = 0.000_35;
 /// A vertex this far inside the ball belongs to the pocket behind the lids, metres.
@@ -54,7 +57,7 @@ pub fn fields(mesh: &Mesh, regions: &[Region], eyes: [Eyeball; 2], ibug68: &[Vec
             autorig::smooth(&graph, &mut field, 1, |_, _| true);
             field
         };
-        let upper = field(angles(BLINKS[s]), SHUT_DEGREES);
+        let upper = field(angles(BLINKS[s]), SHAPE_DEGREES);
         let squint = angles(SQUINTS[s]);
         let mut lowest: Vec<f32> =
             (0..squint.len()).filter(|&v| is_in_front(v) && regions[v] == Region::Eyelid).map(|v| squint[v]).collect();

@@ -11,8 +11,8 @@ use glam::{Vec2, Vec3};
 use rhytid_shared::ARKIT_NAMES;
 
 /// Angles of its ends about the vertical axis through the eye, outwards positive, degrees.
-const SPAN_DEGREES: [f32; 2] = [-24.0, 44.0];
-const NUM_STEPS: usize = 40;
+const SPAN_DEGREES: [f32; 2] = [-33.0, 52.0];
+const NUM_STEPS: usize = 56;
 /// How far the water climbs up the ball over the lid's edge in the middle, metres; it thins out towards the ends. Tears stand
 /// 0.2 to 0.3 mm high (Doughty 2001); twice that, so that a pixel shows it.
 const HEIGHT: f32 = 0.000_55;

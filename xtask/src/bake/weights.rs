@@ -47,7 +47,7 @@ const ECHO_HOLD: f32 = 30.0;
 const CORNER_RANGE: [f32; 2] = [0.002_5, 0.008];
 
 /// Half the width of the strip about the midline over which the bones of one side hand over to those of the other, metres.
-const HALVES_BLEND: f32 = 0.004;
+const HALVES_BLEND: f32 = 0.002_5;
 
 /// Joints a vertex of the file can have.
 const NUM_KEPT: usize = 4;
@@ -117,6 +117,8 @@ pub fn build(skin: &Skin<'_>, rig: &Rig) -> Weights {
     // Where three joints faded at once the fourth took over steeply. Lids and lips are left as their shapes have them.
     let is_open = |v: usize| matches!(skin.regions[v], Region::Face | Region::Body);
     smooth_all(&graph, &mut weights, is_open);
+    // Smoothing carries each half over the midline once more.
+    part_halves_of(skin.mesh, rig, &mut weights);
     weights
 }
 
@@ -220,20 +222,46 @@ fn skin_fields(skin: &Skin<'_>, rig: &Rig, graph: &[Vec<(u32, f32)>]) -> Vec<Vec
     fields
 }
 
+/// Indices of the reaches of mirrored pairs of bones, left and right.
+fn pairs(rig: &Rig) -> Vec<[usize; 2]> {
+    let name = |reach: &Reach| &rig.joints[usize::from(reach.joint)].name;
+    let right_of = |stem: &str| rig.reaches.iter().position(|other| name(other).strip_suffix("_r") == Some(stem));
+    rig.reaches.iter().enumerate().filter_map(|(left, reach)| Some([left, right_of(name(reach).strip_suffix("_l")?)?])).collect()
+}
+
+/// Share of the left one of a mirrored pair of bones at `x`.
+fn share_of_left(x: f32) -> f32 {
+    smoothstep(-HALVES_BLEND, HALVES_BLEND, x)
+}
+
 /// Gives what a bone has beyond the midline to its mirror image: half a face that moves leaves the other alone, and where both
 /// move nothing changes.
 fn part_halves(mesh: &Mesh, rig: &Rig, fields: &mut [Vec<f32>]) {
-    let name = |reach: &Reach| &rig.joints[usize::from(reach.joint)].name;
-    for (left, reach) in rig.reaches.iter().enumerate() {
-        let Some(stem) = name(reach).strip_suffix("_l") else { continue };
-        let Some(right) = rig.reaches.iter().position(|other| name(other).strip_suffix("_r") == Some(stem)) else { continue };
+    for [left, right] in pairs(rig) {
         for (v, position) in mesh.positions.iter().enumerate() {
-            let (of_left, of_right) = (fields[left][v], fields[right][v]);
-            let share = smoothstep(-HALVES_BLEND, HALVES_BLEND, position.x);
-            fields[left][v] = share * (of_left + of_right);
-            fields[right][v] = (1.0 - share) * (of_left + of_right);
+            let both = fields[left][v] + fields[right][v];
+            fields[left][v] = share_of_left(position.x) * both;
+            fields[right][v] = (1.0 - share_of_left(position.x)) * both;
         }
     }
+}
+
+/// As [`part_halves`] for the weights of all joints.
+fn part_halves_of(mesh: &Mesh, rig: &Rig, weights: &mut Weights) {
+    for joints in pairs(rig).iter().map(|pair| pair.map(|reach| rig.reaches[reach].joint)) {
+        for (list, position) in weights.iter_mut().zip(&mesh.positions) {
+            let both: f32 = list.iter().filter(|(joint, _)| joints.contains(joint)).map(|&(_, weight)| weight).sum();
+            let left = share_of_left(position.x);
+            let num_others = list.iter().filter(|(joint, _)| !joints.contains(joint)).count();
+            // A vertex that has no place for a second joint gives all to the nearer half.
+            let shares = if num_others + 2 > NUM_KEPT { [left.round(), 1.0 - left.round()] } else { [left, 1.0 - left] };
+            if both > 0.0 {
+                list.retain(|(joint, _)| !joints.contains(joint));
+                list.extend(joints.into_iter().zip(shares.map(|share| share * both)).filter(|&(_, weight)| weight > 0.0));
+            }
+        }
+    }
+    weights.iter_mut().for_each(|list| list.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0))));
 }
 
 /// Influence of a bone's echoes.

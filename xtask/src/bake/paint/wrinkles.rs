@@ -197,15 +197,15 @@ fn stretch(pen: &mut Pen) {
 fn compress(pen: &mut Pen) {
     pen.seed = 300;
     // The two long frown lines are never equal, and a third one stands between.
-    pen.line(Side::Left, &[(22, -4.6, -11.0), (22, -3.6, -3.0), (22, -2.6, 6.0), (22, -1.2, 17.0)], 1.15, 0.95, frown);
-    pen.line(Side::Right, &[(22, -4.0, -9.0), (22, -3.4, -2.0), (22, -2.4, 5.0), (22, -0.6, 13.0)], 0.95, 0.9, frown);
+    pen.line(Side::Left, &[(22, -4.6, -11.0), (22, -3.6, -3.0), (22, -2.8, 4.0), (22, -2.0, 10.0)], 0.85, 0.95, frown);
+    pen.line(Side::Right, &[(22, -4.0, -9.0), (22, -3.4, -2.0), (22, -2.6, 3.0), (22, -1.6, 8.0)], 0.72, 0.9, frown);
     pen.line(Side::Right, &[(22, -8.4, -3.0), (22, -8.2, 3.0), (22, -7.4, 10.0)], 0.42, 0.65, frown);
     for side in Side::BOTH {
         // Skin gathered over the inner brow.
         pen.line(side, &[(22, 2.5, 3.5), (22, 5.0, 8.0), (23, -3.0, 11.0)], 0.38, 0.8, |s| s.shoulder = 3.4);
         pen.line(side, &[(23, -2.0, 5.0), (23, 1.0, 8.5), (23, 6.0, 11.0)], 0.24, 0.75, |s| s.shoulder = 3.0);
         // The brow pressed down over the lid.
-        pen.line(side, &[(42, 0.0, 4.5), (42, 6.0, 7.0), (43, 2.0, 7.0), (44, 2.0, 6.5)], 0.42, 0.75, |s| s.lean = 0.4);
+        pen.line(side, &[(42, 0.0, 4.5), (42, 6.0, 7.0), (43, 2.0, 7.0), (44, 2.0, 6.5)], 0.32, 0.75, |s| s.lean = 0.4);
         // Bunny lines.
         pen.line(side, &[(27, 4.0, -3.0), (27, 8.5, -6.5), (27, 12.5, -11.0)], 0.55, 0.7, bunny);
         pen.line(side, &[(28, 2.2, 5.0), (28, 7.0, 0.5), (28, 11.5, -4.5), (28, 14.5, -9.0)], 0.62, 0.75, bunny);
@@ -226,7 +226,7 @@ fn compress(pen: &mut Pen) {
             s.taper = (0.2, 0.6);
         });
     }
-    for (height, depth, half) in [(3.2, 0.75, 8.5), (-0.8, 0.6, 7.5), (-4.6, 0.36, 6.0)] {
+    for (height, depth, half) in [(2.6, 0.34, 8.0), (-1.2, 0.28, 7.0), (-4.6, 0.18, 6.0)] {
         let mut dice = pen.dice();
         let (left, right) = (half * dice.range(0.8, 1.15), half * dice.range(0.8, 1.15));
         let points = [(-right, 0.6), (-right * 0.4, -0.2), (0.0, -0.8), (left * 0.45, 0.1), (left, 1.0)];
@@ -331,7 +331,7 @@ fn pucker(pen: &mut Pen) -> Vec<Dimples> {
     let scale = chart.scale();
     for (border, up) in &lips {
         // On the skin: a fan of lines towards the mouth. On the red: finer and more of them.
-        for (count, inward, outward, depth, width) in [(13, 1.5, 9.0, 0.48, 0.66), (21, 3.6, 1.0, 0.30, 0.5)] {
+        for (count, inward, outward, depth, width) in [(13, 1.5, 8.0, 0.28, 0.66), (21, 3.6, 1.0, 0.30, 0.5)] {
             for i in 0..count {
                 let mut dice = pen.dice();
                 let share = (i as f32 + 0.5 + 0.35 * dice.signed()) / count as f32;
@@ -355,7 +355,7 @@ fn pucker(pen: &mut Pen) -> Vec<Dimples> {
             }
         }
     }
-    pen.line(Side::Left, &[(48, 6.0, -13.0), (57, -8.0, -9.0), (57, 0.0, -8.0), (57, 8.0, -9.0), (54, -6.0, -13.0)], 0.7, 1.3, |s| {
+    pen.line(Side::Left, &[(48, 6.0, -13.0), (57, -8.0, -9.0), (57, 0.0, -8.0), (57, 8.0, -9.0), (54, -6.0, -13.0)], 0.32, 1.3, |s| {
         s.shoulder = 4.0;
         s.broken = 0.1;
         s.companions = 3;
