@@ -20,23 +20,34 @@ use rhytid_shared::RoomName;
 use serde::Deserialize;
 use std::collections::HashMap;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{Notify, mpsc, watch};
 use tokio_tungstenite::tungstenite::Bytes;
 
-pub(crate) use lease::LeaseError;
+use lease::Entering;
 pub(crate) use wire::{Kept, StateHead};
-use wire::{Lease, MOST_LISTED, NodeListing};
+use wire::{EnterAnswer, EnterQuestion, Lease, LISTED_AT_ONCE, MOST_LISTED, NodeListing};
 
 /// Packets that wait for the connection to NATS; what finds no place is lost to other nodes, whose viewers see the next one.
 const MOST_WAITING: usize = 4096;
 /// How long NATS, or another node through it, may take to answer.
-const REQUEST_TIMEOUT: Duration = Duration::from_millis(400);
+const REQUEST_TIMEOUT: Duration = Duration::from_millis(300);
+/// How long NATS may take to make a bucket.
+const BUCKET_TIMEOUT: Duration = Duration::from_secs(3);
+/// How long a start waits for NATS: a publisher that comes in the first moment would else find a node that is on its own.
+const FIRST_JOIN: Duration = Duration::from_secs(2);
+/// How long the others may take to find NATS again when it is back: until then who does not answer may live.
+const GATHERING: Duration = Duration::from_secs(3);
 /// How often a node tells of itself and looks after its leases.
 const ROUND: Duration = Duration::from_millis(500);
 /// A node that has told nothing for this long is not listed.
 const FORGOTTEN: Duration = Duration::from_secs(3);
+/// Nodes that are listed.
+const MOST_NODES: usize = 1024;
+/// Messages of one subscription that wait for this node; more are lost, and their rooms ask for a key packet.
+const MOST_UNREAD: usize = 4096;
 /// What is kept of rooms nobody comes back to.
 const KEPT_FOR: Duration = Duration::from_secs(24 * 3600);
 /// Largest record kept of a performer.
@@ -56,6 +67,15 @@ pub struct ClusterConfig {
     /// Authorities that NATS's certificate is trusted by, besides the system's.
     #[arg(long = "cluster-ca", value_name = "FILE.pem")]
     pub ca: Option<PathBuf>,
+    /// A certificate that this node shows to NATS.
+    #[arg(long = "cluster-cert", value_name = "FILE.pem", requires = "cluster_key")]
+    pub cert: Option<PathBuf>,
+    /// The private key of --cluster-cert.
+    #[arg(long = "cluster-key", id = "cluster_key", value_name = "FILE.pem", requires = "cert")]
+    pub key: Option<PathBuf>,
+    /// Servers of a NATS cluster that keep each record, 1 to 5; 1 where it is not said.
+    #[arg(long = "cluster-replicas", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=5))]
+    pub replicas: Option<u8>,
     /// Where other nodes send publishers of a room whose home this node is; default: the address it listens on.
     #[arg(long = "cluster-advertise", value_name = "URL")]
     pub advertise: Option<String>,
@@ -110,26 +130,52 @@ struct Buckets {
 #[derive(Debug, Clone)]
 struct Held {
     lease: Lease,
-    /// Of its record; `None` where NATS was not to be had and it has yet to be claimed.
+    /// Of its record; `None` where NATS was not to be had, or has come back, and it has yet to be claimed.
     revision: Option<u64>,
     /// Since when its room has had no publisher.
     empty_since: Option<Instant>,
 }
 
+/// Connections to NATS.
+struct Connections {
+    /// Made so far.
+    made: AtomicU64,
+    /// A new one stands, or one is lost.
+    changed: Notify,
+}
+
+/// What another node tells of itself.
+struct Told {
+    heard: Instant,
+    address: String,
+    /// Its rooms, in the parts in which they come.
+    parts: Vec<Vec<RoomListing>>,
+}
+
 /// This node among others.
 pub(crate) struct Cluster {
     client: Client,
+    connections: Arc<Connections>,
+    /// Which connection the buckets and leases have been looked at through, and since when.
+    joined: watch::Sender<(u64, Instant)>,
     node: String,
     address: String,
+    replicas: usize,
     /// Nodes with another character are another cluster: their packets mean nothing here.
     prefix: String,
     outbound: Mutex<Option<mpsc::Receiver<Outbound>>>,
     outlet: Outlet,
     buckets: OnceLock<Buckets>,
     held: Mutex<HashMap<RoomName, Held>>,
+    /// Rooms that trackers have asked for, which cannot wait.
+    entering: Mutex<HashMap<RoomName, Entering>>,
+    /// The service ends: no room gets its home here.
+    is_leaving: std::sync::atomic::AtomicBool,
     /// Rooms of which this node's viewers want to see something, as they come and go.
     interest: watch::Sender<()>,
-    nodes: Mutex<HashMap<String, (Instant, NodeListing)>>,
+    /// Rooms whose home has changed.
+    homes: watch::Sender<()>,
+    nodes: Mutex<HashMap<String, Told>>,
     leases: Mutex<HashMap<RoomName, Lease>>,
 }
 
@@ -153,18 +199,32 @@ impl Cluster {
         if let Some(ca) = &config.ca {
             options = options.add_root_certificates(ca.clone());
         }
+        if let (Some(cert), Some(key)) = (&config.cert, &config.key) {
+            options = options.add_client_certificate(cert.clone(), key.clone());
+        }
         let servers: Vec<String> = url.split(',').map(|server| server.trim().to_owned()).collect();
+        let connections = Arc::new(Connections { made: AtomicU64::new(0), changed: Notify::new() });
+        let counted = connections.clone();
         let client = options
             .name("rhytid")
             .retry_on_initial_connect()
             .connection_timeout(Duration::from_secs(3))
-            .ping_interval(Duration::from_secs(2))
+            // Three of them without an answer end a connection.
+            .ping_interval(Duration::from_secs(1))
             .request_timeout(Some(REQUEST_TIMEOUT))
+            .subscription_capacity(MOST_UNREAD)
             .reconnect_delay_callback(|attempts| Duration::from_millis((50 * attempts as u64).min(1000)))
-            .event_callback(async |event| match event {
-                Event::Connected => tracing::info!("NATS reached"),
-                Event::Disconnected => tracing::warn!("NATS lost: this node's own rooms go on"),
-                event => tracing::warn!(%event, "NATS"),
+            .event_callback(move |event| {
+                match &event {
+                    Event::Connected => {
+                        tracing::info!("NATS reached");
+                        counted.made.fetch_add(1, Ordering::SeqCst);
+                    }
+                    Event::Disconnected => tracing::warn!("NATS lost: this node's own rooms go on"),
+                    event => tracing::warn!(%event, "NATS"),
+                }
+                counted.changed.notify_one();
+                std::future::ready(())
             })
             .connect(servers)
             .await
@@ -173,13 +233,19 @@ impl Cluster {
         Ok(Arc::new(Self {
             node: node_id(),
             address,
+            replicas: usize::from(config.replicas.unwrap_or(1)),
             prefix: format!("rhytid.{}", &character_sha256[..8.min(character_sha256.len())]),
             client,
+            connections,
+            joined: watch::Sender::new((0, Instant::now())),
             outbound: Mutex::new(Some(outbound)),
             outlet: Outlet(outlet),
             buckets: OnceLock::new(),
             held: Mutex::default(),
+            entering: Mutex::default(),
+            is_leaving: false.into(),
             interest: watch::Sender::new(()),
+            homes: watch::Sender::new(()),
             nodes: Mutex::default(),
             leases: Mutex::default(),
         }))
@@ -198,23 +264,45 @@ impl Cluster {
     /// Why the node is on its own, if so.
     pub fn problem(&self) -> Option<&'static str> {
         match self.client.connection_state() {
-            State::Connected if self.buckets.get().is_some() => None,
+            State::Connected if self.joined.borrow().0 == self.connection() => None,
             State::Connected => Some("NATS has no JetStream yet"),
             _ => Some("NATS is not reached"),
+        }
+    }
+
+    /// Which connection to NATS stands, or stood last.
+    fn connection(&self) -> u64 {
+        self.connections.made.load(Ordering::SeqCst)
+    }
+
+    /// The connection is so fresh that others may not be back yet.
+    fn is_gathering(&self) -> bool {
+        let (connection, since) = *self.joined.borrow();
+        // The first one is as old as this node, and no sign that the others have lost theirs.
+        connection > 1 && since.elapsed() < GATHERING
+    }
+
+    /// Waits until the node has joined, but not for long.
+    pub async fn wait(&self) {
+        let mut joined = self.joined.subscribe();
+        if tokio::time::timeout(FIRST_JOIN, joined.wait_for(|(connection, _)| *connection > 0)).await.is_err() {
+            tracing::warn!("NATS is not reached yet: this node is on its own");
         }
     }
 
     /// Rooms elsewhere, all or those of one name, by the node that told of them.
     pub fn elsewhere(&self, name: Option<&RoomName>) -> Vec<(String, RoomListing)> {
         let mut nodes = lock(&self.nodes);
-        nodes.retain(|_, (heard, _)| heard.elapsed() < FORGOTTEN);
-        let rooms = nodes.values().flat_map(|(_, told)| told.rooms.iter().map(|room| (told.node.clone(), room.clone())));
+        nodes.retain(|_, told| told.heard.elapsed() < FORGOTTEN);
+        let rooms = nodes.iter().flat_map(|(node, told)| told.parts.iter().flatten().map(|room| (node.clone(), room.clone())));
         rooms.filter(|(_, room)| name.is_none_or(|name| name.as_str() == room.name)).collect()
     }
 
-    /// Whose rooms are whose has changed.
-    fn interest_changed(&self) {
-        self.interest.send_replace(());
+    /// All nodes that are heard of and this one, by id, each with its address.
+    pub fn nodes(&self) -> std::collections::BTreeMap<String, String> {
+        let nodes = lock(&self.nodes);
+        let others = nodes.iter().filter(|(_, told)| told.heard.elapsed() < FORGOTTEN).map(|(node, told)| (node, &told.address));
+        others.chain([(&self.node, &self.address)]).map(|(node, address)| (node.clone(), address.clone())).collect()
     }
 
     fn subject(&self, rest: &str) -> String {
@@ -236,12 +324,9 @@ impl Cluster {
         tasks.spawn(self.clone().look_after(rooms.clone()));
         tasks.spawn(feed::run(self.clone(), rooms));
         let mut shutdown = shutdown.clone();
-        let cluster = self.clone();
         tokio::spawn(async move {
             stopped(&mut shutdown).await;
             tasks.shutdown().await;
-            // What publishers of this node had is free at once for the node that they come to.
-            cluster.release_all().await;
         });
     }
 
@@ -256,23 +341,23 @@ impl Cluster {
         }
     }
 
-    /// Answers what other nodes ask: what slots a room has, its newest state, and to let a room go.
+    /// Answers what other nodes ask: whether one of them may be a room's home, and for a room's newest state.
     async fn answer(self: Arc<Self>, rooms: Weak<Rooms>) {
         let subject = self.subject(&format!("node.{}.*", self.node));
         let Ok(mut questions) = self.client.subscribe(subject).await else { return };
         while let Some(message) = questions.next().await {
             let (Some(rooms), Some(reply)) = (rooms.upgrade(), message.reply.clone()) else { continue };
-            let Some(room) = std::str::from_utf8(&message.payload).ok().and_then(|name| RoomName::new(name).ok()) else { continue };
             let answer: Bytes = match message.subject.rsplit('.').next() {
-                Some("slots") => {
-                    let answer = wire::RoomAnswer { slots: rooms.slots(&room) };
+                Some("enter") => {
+                    let Ok(question) = serde_json::from_slice::<EnterQuestion>(&message.payload) else { continue };
+                    let answer = self.let_go(&rooms, &question);
                     serde_json::to_vec(&answer).expect("plain data can be written").into()
                 }
-                Some("state") => wire::join(&rooms.newest(&room)),
-                Some("yield") => {
-                    lock(&self.held).remove(&room);
-                    rooms.evict(&room);
-                    Bytes::new()
+                Some("state") => {
+                    let Some(room) = std::str::from_utf8(&message.payload).ok().and_then(|name| RoomName::new(name).ok()) else {
+                        continue;
+                    };
+                    wire::join(&rooms.newest(&room))
                 }
                 _ => continue,
             };
@@ -282,15 +367,38 @@ impl Cluster {
         }
     }
 
+    /// Lets go of a room where its publishers allow it.
+    fn let_go(&self, rooms: &Rooms, question: &EnterQuestion) -> EnterAnswer {
+        let Ok(room) = RoomName::new(&question.room) else { return EnterAnswer::default() };
+        let slots = rooms.slots(&room);
+        let is_the_one = |&(_, session): &(String, u32)| question.resume == Some(session);
+        let is_granted = question.takeover || slots.iter().all(is_the_one);
+        if is_granted {
+            lock(&self.held).remove(&room);
+            rooms.evict(&room, None);
+        }
+        EnterAnswer { is_granted, slots: slots.into_iter().map(|(slot, _)| slot).collect() }
+    }
+
     async fn hear_of_nodes(self: Arc<Self>) {
         let Ok(mut listings) = self.client.subscribe(self.subject("listing")).await else { return };
         while let Some(message) = listings.next().await {
-            match serde_json::from_slice::<NodeListing>(&message.payload) {
-                Ok(told) if told.node != self.node => {
-                    lock(&self.nodes).insert(told.node.clone(), (Instant::now(), told));
+            let told = match serde_json::from_slice::<NodeListing>(&message.payload) {
+                Ok(told) => told,
+                Err(error) => {
+                    tracing::debug!(%error, "listing of another node not read");
+                    continue;
                 }
-                Ok(_) => {}
-                Err(error) => tracing::debug!(%error, "listing of another node not read"),
+            };
+            let mut nodes = lock(&self.nodes);
+            if told.node == self.node || (nodes.len() >= MOST_NODES && !nodes.contains_key(&told.node)) {
+                continue;
+            }
+            let known = nodes.entry(told.node).or_insert_with(|| Told { heard: Instant::now(), address: String::new(), parts: Vec::new() });
+            (known.heard, known.address) = (Instant::now(), told.address);
+            known.parts.resize_with(told.of.clamp(1, MOST_LISTED / LISTED_AT_ONCE), Vec::new);
+            if let Some(part) = known.parts.get_mut(told.part) {
+                *part = told.rooms;
             }
         }
     }
@@ -301,27 +409,55 @@ impl Cluster {
         round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut watching: Option<tokio::task::JoinHandle<()>> = None;
         loop {
-            round.tick().await;
+            tokio::select! {
+                _ = round.tick() => {}
+                () = self.connections.changed.notified() => {}
+            }
             let Some(rooms) = rooms.upgrade() else { return };
             if self.client.connection_state() != State::Connected {
                 continue;
             }
-            if self.buckets.get().is_none() {
-                match self.make_buckets().await {
-                    Ok(buckets) => drop(self.buckets.set(buckets)),
-                    Err(problem) => {
+            let connection = self.connection();
+            let is_new = self.joined.borrow().0 != connection;
+            if is_new {
+                // Also where they were there before: NATS may have come back without them.
+                match tokio::time::timeout(BUCKET_TIMEOUT, self.make_buckets()).await {
+                    Ok(Ok(buckets)) => drop(self.buckets.set(buckets)),
+                    Ok(Err(problem)) => {
                         tracing::warn!(problem, "JetStream is not to be had");
                         continue;
                     }
+                    Err(_) => {
+                        tracing::warn!("JetStream does not answer");
+                        continue;
+                    }
+                }
+                // What it has of them may be older than what is held.
+                lock(&self.held).values_mut().for_each(|held| held.revision = None);
+            }
+            if is_new || watching.as_ref().is_none_or(tokio::task::JoinHandle::is_finished) {
+                if let Some(watching) = watching.replace(tokio::spawn(self.clone().watch_leases(Arc::downgrade(&rooms)))) {
+                    watching.abort();
                 }
             }
-            if watching.as_ref().is_none_or(tokio::task::JoinHandle::is_finished) {
-                watching = Some(tokio::spawn(self.clone().watch_leases(Arc::downgrade(&rooms))));
+            if is_new {
+                self.joined.send_replace((connection, Instant::now()));
+                self.homes.send_replace(());
+                tracing::info!(node = self.node, "joined the cluster");
             }
             self.renew(&rooms).await;
-            let mut told = rooms.list();
-            told.truncate(MOST_LISTED);
-            let told = NodeListing { node: self.node.clone(), address: self.address.clone(), rooms: told };
+            self.tell(&rooms).await;
+        }
+    }
+
+    /// Tells other nodes of this one's rooms.
+    async fn tell(&self, rooms: &Rooms) {
+        let mut listed = rooms.list();
+        listed.truncate(MOST_LISTED);
+        let of = listed.len().div_ceil(LISTED_AT_ONCE).max(1);
+        for part in 0..of {
+            let rooms = listed.drain(..listed.len().min(LISTED_AT_ONCE)).collect();
+            let told = NodeListing { node: self.node.clone(), address: self.address.clone(), part, of, rooms };
             let text = serde_json::to_vec(&told).expect("plain data can be written");
             if let Err(error) = self.client.publish(self.subject("listing"), text.into()).await {
                 tracing::debug!(%error, "listing not sent");
@@ -335,6 +471,7 @@ impl Cluster {
             bucket: format!("{}_{name}", self.prefix.replace('.', "_")),
             max_age: KEPT_FOR,
             max_value_size,
+            num_replicas: self.replicas,
             ..kv::Config::default()
         };
         let leases = jetstream.create_key_value(bucket("leases", 4096)).await.map_err(|error| error.to_string())?;
@@ -343,7 +480,7 @@ impl Cluster {
     }
 
     /// What the cluster keeps of a room's slot.
-    pub async fn kept(&self, room: &RoomName, slot: &str) -> Option<Kept> {
+    async fn kept(&self, room: &RoomName, slot: &str) -> Option<Kept> {
         let buckets = self.buckets.get()?;
         let bytes = tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.get(format!("{room}.{slot}"))).await.ok()?.ok()??;
         serde_json::from_slice(&bytes).ok()

@@ -224,7 +224,7 @@ async fn rooms(State(hub): State<Arc<Hub>>, request: Request) -> Response {
     };
     let Some(cluster) = &hub.cluster else { return axum::Json(serde_json::json!({ "rooms": own })).into_response() };
     let rooms = room::merge(cluster.node(), own, cluster.elsewhere(asked.as_ref()));
-    axum::Json(serde_json::json!({ "node": cluster.node(), "rooms": rooms })).into_response()
+    axum::Json(serde_json::json!({ "node": cluster.node(), "nodes": cluster.nodes(), "rooms": rooms })).into_response()
 }
 
 /// Lets in who may see a listing: of the room that the query names, as `role`, or of all there is.

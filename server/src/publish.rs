@@ -53,15 +53,7 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName, pass: &Pass) -
         },
     };
     if let Some(cluster) = &hub.cluster {
-        cluster
-            .enter(&hub.rooms, room, &hello.slot.name, hello.takeover)
-            .await
-            .map_err(|error| refusal(error.code(), error.to_string()))?;
-        if hello.keep_neutral
-            && let Some(kept) = cluster.kept(room, &hello.slot.name).await
-        {
-            hub.rooms.restore(room, &hello.slot.name, kept);
-        }
+        cluster.enter(&hub.rooms, room, &hello).await.map_err(|error| refusal(error.code(), error.to_string()))?;
     }
     let (source, evicted) = Source::open(hub, room, hello).map_err(not_opened)?;
     let heard = Heard::now();
@@ -251,7 +243,10 @@ fn not_opened(error: OpenError) -> Stop {
         OpenError::Room(refused) => {
             let code = match refused {
                 RoomError::Taken | RoomError::SlotTaken => CloseCode::Policy,
-                RoomError::TooManyRooms { .. } | RoomError::TooManyViewers { .. } | RoomError::TooManySlots { .. } => CloseCode::Again,
+                RoomError::TooManyRooms { .. }
+                | RoomError::TooManyViewers { .. }
+                | RoomError::TooManySlots { .. }
+                | RoomError::Elsewhere => CloseCode::Again,
             };
             Ending::error(code, ErrorMessage::new(refused.code(), refused.to_string())).into()
         }

@@ -37,7 +37,7 @@ impl Latest {
         let make = || {
             let (mut decoder, mut frame) = (Decoder::new(layout.clone()), layout.frame_at_rest());
             for packet in [Some(&self.key.bytes), self.delta.as_ref()].into_iter().flatten() {
-                decoder.decode(packet, &mut frame).expect("a packet of the room's own encoder can be read");
+                decoder.decode(packet, &mut frame).expect("it comes from the room's own encoder, or was read when it came");
             }
             let message = ViewMessage::Frame(JsonFrame::new(&frame, character));
             serde_json::to_string(&message).expect("plain data can be written").into()
@@ -59,6 +59,8 @@ pub(crate) enum RoomError {
     SlotTaken,
     #[error("the room has {most} sources already, which is the limit")]
     TooManySlots { most: usize },
+    #[error("another node has become the room's home in this moment; try again")]
+    Elsewhere,
 }
 
 impl RoomError {
@@ -70,6 +72,7 @@ impl RoomError {
             Self::Taken => "room_taken",
             Self::SlotTaken => "slot_taken",
             Self::TooManySlots { .. } => "too_many_slots",
+            Self::Elsewhere => "room_elsewhere",
         }
     }
 }
@@ -86,12 +89,14 @@ pub(crate) struct SlotClaim {
     pub source: String,
     /// Take the slot over from another publisher.
     pub takeover: bool,
+    /// Take it over from this session, which was the claimant's own.
+    pub resume: Option<u32>,
 }
 
 impl SlotClaim {
     /// As a hello says it.
     pub fn of(hello: &PublishHello) -> Self {
-        Self { slot: hello.slot.clone(), source: hello.source.clone(), takeover: hello.takeover }
+        Self { slot: hello.slot.clone(), source: hello.source.clone(), takeover: hello.takeover, resume: hello.resume }
     }
 }
 
@@ -145,11 +150,21 @@ struct RoomState {
     /// By slot, at most [`MAX_SLOTS`].
     neutrals: BTreeMap<String, Neutral>,
     empty_since: Instant,
-    /// Epoch under which packets leave for other nodes.
+    /// This node is the room's home; where there are no others it always is.
+    is_home: bool,
+    /// Epoch under which packets leave for other nodes; what comes under an older one is old.
     epoch: u64,
-    /// The newest state that came from another node, and the key packet that its deltas need.
-    fed: Option<StateHead>,
-    fed_key: Option<(u64, u64)>,
+    /// What came from another node.
+    fed: Option<Box<FedState>>,
+}
+
+/// The newest state that came from another node.
+struct FedState {
+    head: StateHead,
+    /// Epoch and index of the key packet that its deltas need.
+    key: (u64, u64),
+    decoder: Decoder,
+    frame: FaceFrame,
 }
 
 /// What became of another node's packet.
@@ -161,6 +176,8 @@ pub(crate) enum Fed {
     Old,
     /// It needs a key packet that did not come.
     NeedsKey,
+    /// It cannot be read.
+    Broken,
 }
 
 /// The neutral face that a session came to: kept so that a publisher which comes back need not be searched again.
@@ -266,9 +283,12 @@ impl Rooms {
         let mut by_name = lock(&self.by_name);
         let room = self.find_or_make(&mut by_name, name)?;
         let mut state = lock(&room.state);
+        if !state.is_home {
+            return Err(RoomError::Elsewhere);
+        }
         let before = state.publishers.iter().position(|publisher| publisher.claim.slot.name == claim.slot.name);
         match before {
-            Some(_) if !claim.takeover => {
+            Some(at) if !claim.takeover && claim.resume != Some(state.publishers[at].session) => {
                 return Err(if claim.slot.name == Slot::MAIN { RoomError::Taken } else { RoomError::SlotTaken });
             }
             None if state.publishers.len() >= MAX_SLOTS => return Err(RoomError::TooManySlots { most: MAX_SLOTS }),
@@ -318,9 +338,9 @@ impl Rooms {
                 shown: None,
                 neutrals: BTreeMap::new(),
                 empty_since: Instant::now(),
+                is_home: self.others.is_none(),
                 epoch: 0,
                 fed: None,
-                fed_key: None,
             }),
             layout,
             metrics: self.metrics.clone(),
@@ -344,22 +364,34 @@ impl Rooms {
         state.neutrals.get(&hello.slot.name).filter(|neutral| neutral.kept.tracker == hello.tracker()).map(|neutral| neutral.kept.clone())
     }
 
-    /// Takes over what other nodes keep of a room's slot, unless something is kept here.
+    /// True where something is kept of a room's slot.
+    pub fn has_kept(&self, name: &RoomName, slot: &str) -> bool {
+        self.find(name).is_some_and(|room| lock(&room.state).neutrals.contains_key(slot))
+    }
+
+    /// Takes over what other nodes keep of a room's slot.
     pub fn restore(&self, name: &RoomName, slot: &str, kept: Kept) {
         let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
         let mut state = lock(&room.state);
-        if state.neutrals.len() < MAX_SLOTS {
-            state.neutrals.entry(slot.to_owned()).or_insert(Neutral { session: 0, kept });
+        if state.neutrals.len() < MAX_SLOTS || state.neutrals.contains_key(slot) {
+            state.neutrals.insert(slot.to_owned(), Neutral { session: 0, kept });
         }
     }
 
-    /// Slots of a room that are taken.
-    pub fn slots(&self, name: &RoomName) -> Vec<String> {
-        let Some(room) = self.find(name) else { return Vec::new() };
-        lock(&room.state).publishers.iter().map(|publisher| publisher.claim.slot.name.clone()).collect()
+    /// Forgets what is kept of a room: another node, which was its home, knows better.
+    pub fn forget_kept(&self, name: &RoomName) {
+        if let Some(room) = self.find(name) {
+            lock(&room.state).neutrals.clear();
+        }
     }
 
-    /// Sessions that a room has had.
+    /// Slots of a room that are taken, each with its session.
+    pub fn slots(&self, name: &RoomName) -> Vec<(String, u32)> {
+        let Some(room) = self.find(name) else { return Vec::new() };
+        lock(&room.state).publishers.iter().map(|publisher| (publisher.claim.slot.name.clone(), publisher.session)).collect()
+    }
+
+    /// The greatest number that a session of a room has had, as far as is known here.
     pub fn num_sessions(&self, name: &RoomName) -> u32 {
         self.find(name).map_or(0, |room| lock(&room.state).num_sessions)
     }
@@ -368,7 +400,7 @@ impl Rooms {
     pub fn newest(&self, name: &RoomName) -> Vec<Bytes> {
         let Some(room) = self.find(name) else { return Vec::new() };
         let state = lock(&room.state);
-        let Some(latest) = room.slot.borrow().clone() else { return Vec::new() };
+        let Some(latest) = room.slot.borrow().clone().filter(|_| state.is_home) else { return Vec::new() };
         let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
         let key = head(latest.key.index).message(&latest.key.bytes);
         latest.delta.iter().fold(vec![key], |mut messages, delta| {
@@ -381,14 +413,32 @@ impl Rooms {
     pub fn lead(&self, name: &RoomName, epoch: u64, sessions: u32) {
         let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
         let mut state = lock(&room.state);
-        state.epoch = epoch;
+        (state.is_home, state.epoch) = (true, epoch);
         state.num_sessions = state.num_sessions.max(sessions);
     }
 
-    /// Sends a room's publishers away: another node is its home.
-    pub fn evict(&self, name: &RoomName) {
+    /// This node is a room's home no longer, unless somebody publishes to it.
+    pub fn give_up(&self, name: &RoomName) -> bool {
+        let Some(room) = self.find(name) else { return true };
+        let mut state = lock(&room.state);
+        if state.publishers.is_empty() {
+            state.is_home = false;
+        }
+        !state.is_home
+    }
+
+    /// Sends a room's publishers away: another node is its home, under `epoch` where that is known.
+    pub fn evict(&self, name: &RoomName, epoch: Option<u64>) {
         let Some(room) = self.find(name) else { return };
         let mut state = lock(&room.state);
+        state.is_home = false;
+        if let Some(epoch) = epoch {
+            // Where both were cut off from each other, this one's may be the greater.
+            state.epoch = epoch;
+            if state.fed.as_ref().is_some_and(|fed| fed.head.epoch > epoch) {
+                state.fed = None;
+            }
+        }
         for publisher in std::mem::take(&mut state.publishers) {
             state.mixer.leave(publisher.session);
             self.metrics.publishers.dec();
@@ -437,23 +487,44 @@ impl Room {
     pub fn feed(&self, head: StateHead, packet: Bytes) -> Fed {
         let mut guard = lock(&self.state);
         let state = &mut *guard;
-        if !state.publishers.is_empty() || state.epoch > head.epoch || state.fed.is_some_and(|fed| head <= fed) {
+        if state.is_home || head.epoch < state.epoch || state.fed.as_ref().is_some_and(|fed| head <= fed.head) {
             return Fed::Old;
         }
+        let is_key = head.index == head.key_index;
         let key = (head.epoch, head.key_index);
-        let delta = if head.index == head.key_index {
-            state.key = Some(Arc::new(KeyPacket { index: state.num_states + 1, bytes: packet }));
-            state.fed_key = Some(key);
-            None
-        } else if state.fed_key == Some(key) {
-            Some(packet)
-        } else {
-            return Fed::NeedsKey;
+        let fed = match &mut state.fed {
+            Some(fed) if is_key || fed.key == key => fed,
+            empty @ None if is_key => empty.insert(Box::new(FedState {
+                head: StateHead { epoch: 0, index: 0, key_index: 0 },
+                key: (0, 0),
+                decoder: Decoder::new(self.layout.clone()),
+                frame: self.layout.frame_at_rest(),
+            })),
+            _ => return Fed::NeedsKey,
         };
-        let Some(key) = state.key.clone() else { return Fed::NeedsKey };
-        state.fed = Some(head);
+        // Here, once for all viewers: what cannot be read goes no further.
+        let is_sound = match fed.decoder.decode(&packet, &mut fed.frame) {
+            Ok(kind) => (kind == PacketKind::Key) == is_key,
+            Err(_) => false,
+        };
+        let (delta, key_packet) = match (&state.key, is_key) {
+            _ if !is_sound => {
+                // Its decoder may hold another key packet than is noted.
+                state.fed = None;
+                self.metrics.drop_frames("bad_cluster_packet", 1);
+                return Fed::Broken;
+            }
+            (_, true) => (None, Arc::new(KeyPacket { index: state.num_states + 1, bytes: packet })),
+            (Some(key), false) => (Some(packet), key.clone()),
+            (None, false) => return Fed::NeedsKey,
+        };
+        (fed.head, fed.key) = (head, key);
+        state.shown = Some((fed.frame.seq, fed.frame.captured_at_micros, fed.frame.face));
+        state.num_sessions = state.num_sessions.max(fed.frame.session);
+        state.epoch = head.epoch;
+        state.key = Some(key_packet.clone());
         state.num_states += 1;
-        self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key, delta, json: OnceLock::new() })));
+        self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key: key_packet, delta, json: OnceLock::new() })));
         Fed::Taken
     }
 
@@ -583,7 +654,8 @@ impl Publishing {
             return false;
         }
         neutrals.insert(slot.to_owned(), Neutral { session: self.session, kept });
-        true
+        // Where another node is the home by now, it knows better.
+        state.is_home
     }
 }
 

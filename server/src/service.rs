@@ -208,8 +208,8 @@ pub async fn run(
     tracing::info!(%address, character = hub.character.name, "serving");
     if let Some(cluster) = &cluster {
         cluster.start(Arc::downgrade(&rooms), &hub.shutdown);
+        cluster.wait().await;
     }
-    drop(rooms);
     listen::start(&hub, ports);
     vmc_out::start(&hub, outs);
     tokio::pin!(shutdown);
@@ -238,6 +238,10 @@ pub async fn run(
     }
     tracing::info!("shutting down");
     drop(listener);
+    if let Some(cluster) = &cluster {
+        cluster.leave(&rooms).await;
+    }
+    drop(rooms);
     // Receivers live in the hub, so this cannot fail.
     let _ = stop.send(true);
     hub.rooms.wake_viewers();

@@ -97,13 +97,18 @@ impl Source {
     /// Claims the slot that `hello` names. The second value is done when another publisher has taken it over.
     pub fn open(hub: &Hub, room: &RoomName, mut hello: PublishHello) -> Result<(Self, Evicted), OpenError> {
         let kept = hello.keep_neutral.then(|| hub.rooms.kept(room, &hello)).flatten();
+        let resumed = kept.as_ref().filter(|_| hello.resume.is_some()).and_then(|kept| kept.profile.clone());
+        if let Some(profile) = resumed {
+            // One who comes back in the middle finds everything as it was, also what has been changed since its first hello.
+            hello.settings = Settings::default();
+            hello.profile = Some(ProfileChoice::Given(Box::new(profile)));
+        }
         let profile = match hello.profile.take() {
             Some(ProfileChoice::Given(profile)) => Some(*profile),
             Some(ProfileChoice::Named(name)) => match hub.profiles.named(&name) {
                 Some(profile) => Some((*profile).clone()),
                 None => return Err(UnknownProfile(name).into()),
             },
-            // One who comes back finds everything as it was.
             None => match kept.as_ref().and_then(|kept| kept.profile.clone()) {
                 Some(profile) => Some(profile),
                 None => hub.profiles.of_source(&hello.source).map(|profile| (*profile).clone()),
@@ -213,6 +218,7 @@ impl Source {
             self.is_profile_changed |= profile.settings != settings;
             profile.settings = settings;
         }
+        self.keep_neutral();
     }
 
     fn use_profile(&mut self, choice: ProfileChoice) -> Result<Utf8Bytes, ErrorMessage> {
@@ -240,6 +246,7 @@ impl Source {
             false
         });
         (self.profile, self.is_profile_changed) = (Some(profile), false);
+        self.keep_neutral();
         kept
     }
 

@@ -38,6 +38,8 @@ pub struct PublishHello {
     pub focal: Option<f32>,
     /// Take the slot over from another publisher.
     pub takeover: bool,
+    /// Take the slot over from this session, which was the publisher's own until its connection broke, with everything as it was.
+    pub resume: Option<u32>,
     /// The source slot that it claims.
     pub slot: Slot,
     /// Settings to start with.

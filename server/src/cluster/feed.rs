@@ -42,12 +42,33 @@ pub(super) async fn run(cluster: Arc<Cluster>, rooms: Weak<Rooms>) {
 
 async fn feed(cluster: Arc<Cluster>, room: Arc<Room>) {
     let Ok(mut packets) = cluster.client.subscribe(cluster.packets_of(&room.name)).await else { return };
-    // After the subscription, so that nothing lies between what is asked for and what comes.
-    ask(&cluster, &room).await;
-    let mut asked = Instant::now();
-    while let Some(message) = packets.next().await {
-        if take(&room, &message.payload) == Fed::NeedsKey && asked.elapsed() >= ASK_SPACING {
-            asked = Instant::now();
+    let mut homes = cluster.homes.subscribe();
+    homes.mark_changed();
+    let mut asked = (None, 0);
+    let mut asked_at: Option<Instant> = None;
+    loop {
+        let needs_key = tokio::select! {
+            message = packets.next() => match message {
+                Some(message) => take(&room, &message.payload) == Fed::NeedsKey,
+                None => return,
+            },
+            changed = homes.changed() => {
+                if changed.is_err() {
+                    return;
+                }
+                // After the subscription, so that nothing lies between what is asked for and what comes; and again when the home
+                // or the connection is another.
+                let asks = (cluster.home_elsewhere(&room.name), cluster.connection());
+                let is_new = asks.0.is_some() && asks != asked;
+                asked = asks;
+                if is_new {
+                    asked_at = None;
+                }
+                is_new
+            }
+        };
+        if needs_key && asked_at.is_none_or(|at| at.elapsed() >= ASK_SPACING) {
+            asked_at = Some(Instant::now());
             ask(&cluster, &room).await;
         }
     }

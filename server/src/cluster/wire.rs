@@ -71,14 +71,29 @@ pub(crate) struct Lease {
     pub address: String,
     /// Greater with every home.
     pub epoch: u64,
-    /// Sessions that the room has had, or more.
+    /// No session of the room has a greater number, at any node.
     pub sessions: u32,
 }
 
-/// What a home says of a room.
+/// Asks a room's home to let it go.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub(crate) struct RoomAnswer {
-    /// Slots that are taken.
+#[serde(default)]
+pub(crate) struct EnterQuestion {
+    /// The room.
+    pub room: String,
+    /// A publisher wants to have it, whoever has it now.
+    pub takeover: bool,
+    /// A publisher wants to have back what it had in this session.
+    pub resume: Option<u32>,
+}
+
+/// What a home says to that.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub(crate) struct EnterAnswer {
+    /// It is no longer the home.
+    pub is_granted: bool,
+    /// Slots that are, or were, taken.
     pub slots: Vec<String>,
 }
 
@@ -93,19 +108,24 @@ pub(crate) struct Kept {
     pub profile: Option<Profile>,
 }
 
-/// What a node tells of itself every second.
+/// What a node tells of itself every half second.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct NodeListing {
     /// Its id.
     pub node: String,
     /// Where it is reached.
     pub address: String,
-    /// Its rooms, at most [`MOST_LISTED`].
+    /// Which part of its list this is, from 0, and of how many.
+    pub part: usize,
+    pub of: usize,
+    /// Its rooms, at most [`LISTED_AT_ONCE`].
     pub rooms: Vec<RoomListing>,
 }
 
-/// Rooms that a node tells of: a message of NATS holds a megabyte.
+/// Rooms that a node tells of.
 pub(crate) const MOST_LISTED: usize = 1000;
+/// Rooms in one message: NATS takes a megabyte, and a room of eight sources with long names is about 3 KB.
+pub(crate) const LISTED_AT_ONCE: usize = 200;
 
 #[cfg(test)]
 mod tests {
