@@ -13,7 +13,7 @@ mod wire;
 use crate::room::{Others, RoomListing, Rooms};
 use crate::service::stopped;
 use async_nats::connection::State;
-use async_nats::jetstream::kv;
+use async_nats::jetstream::{kv, stream};
 use async_nats::{Client, ConnectOptions, Event};
 use futures_util::StreamExt;
 use rhytid_shared::RoomName;
@@ -50,6 +50,8 @@ const MOST_NODES: usize = 1024;
 const MOST_UNREAD: usize = 4096;
 /// What is kept of rooms nobody comes back to.
 const KEPT_FOR: Duration = Duration::from_secs(24 * 3600);
+/// Largest lease.
+const MOST_LEASE_BYTES: i32 = 4096;
 /// Largest record kept of a performer.
 const MOST_KEPT_BYTES: i32 = 256 << 10;
 
@@ -465,18 +467,29 @@ impl Cluster {
         }
     }
 
+    /// Makes the buckets, or finds that they are there. Each is the stream that a bucket is (ADR-8 of NATS's) and not made as a
+    /// bucket: for that `async-nats` asks for more of the account than a server of version 2.9 says.
     async fn make_buckets(&self) -> Result<Buckets, String> {
         let jetstream = async_nats::jetstream::new(self.client.clone());
-        let bucket = |name: &str, max_value_size: i32| kv::Config {
-            bucket: format!("{}_{name}", self.prefix.replace('.', "_")),
-            max_age: KEPT_FOR,
-            max_value_size,
-            num_replicas: self.replicas,
-            ..kv::Config::default()
+        let make = async |name: &str, max_message_size: i32| {
+            let bucket = format!("{}_{name}", self.prefix.replace('.', "_"));
+            let config = stream::Config {
+                name: format!("KV_{bucket}"),
+                subjects: vec![format!("$KV.{bucket}.>")],
+                max_messages_per_subject: 1,
+                max_age: KEPT_FOR,
+                max_message_size,
+                num_replicas: self.replicas,
+                discard: stream::DiscardPolicy::New,
+                allow_rollup: true,
+                deny_delete: true,
+                allow_direct: true,
+                ..stream::Config::default()
+            };
+            jetstream.get_or_create_stream(config).await.map_err(|error| error.to_string())?;
+            jetstream.get_key_value(bucket).await.map_err(|error| error.to_string())
         };
-        let leases = jetstream.create_key_value(bucket("leases", 4096)).await.map_err(|error| error.to_string())?;
-        let kept = jetstream.create_key_value(bucket("kept", MOST_KEPT_BYTES)).await.map_err(|error| error.to_string())?;
-        Ok(Buckets { leases, kept })
+        Ok(Buckets { leases: make("leases", MOST_LEASE_BYTES).await?, kept: make("kept", MOST_KEPT_BYTES).await? })
     }
 
     /// What the cluster keeps of a room's slot.

@@ -102,8 +102,8 @@ struct SendArgs {
     /// The character that has the clip, instead of the built-in one.
     #[arg(long, value_name = "FILE.glb", requires = "clip")]
     character: Option<PathBuf>,
-    /// The server.
-    #[arg(long, default_value = "ws://127.0.0.1:7878", value_name = "URL")]
+    /// The server, or nodes of a cluster with commas between them: when one is lost, the face goes on at the next.
+    #[arg(long, default_value = "ws://127.0.0.1:7878", value_name = "URL[,URL…]")]
     to: String,
     /// The room.
     #[arg(long, default_value = "demo")]

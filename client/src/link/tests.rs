@@ -30,7 +30,7 @@ impl TestServer {
     fn options(&self, known_sha256: &str) -> LinkOptions {
         let server = format!("ws://{}", self.listener.local_addr().unwrap()).parse().unwrap();
         LinkOptions {
-            server,
+            servers: server,
             room: RoomName::new("demo").unwrap(),
             trust: Trust::Public,
             token: None,
@@ -349,7 +349,7 @@ fn watch(server: &TestServer) -> (Spectator, Socket) {
     let character = two_bones();
     let spectator = Spectator::open(
         WatchArgs {
-            server: server.options("").server,
+            servers: server.options("").servers,
             room: RoomName::new("demo").unwrap(),
             trust: Trust::Public,
             token: TokenArgs::default(),
@@ -430,7 +430,7 @@ fn status_says_that_the_server_is_gone_and_when_it_is_back() {
 fn status_tells_attempts_in_vain_and_refusals() {
     let server = TestServer::start();
     let watched = WatchArgs {
-        server: server.options("").server,
+        servers: server.options("").servers,
         room: RoomName::new("demo").unwrap(),
         trust: Trust::Public,
         token: TokenArgs::default(),
