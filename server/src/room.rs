@@ -154,6 +154,8 @@ struct RoomState {
     is_home: bool,
     /// Epoch under which packets leave for other nodes; what comes under an older one is old.
     epoch: u64,
+    /// States that came before this node was the room's home: they are of another epoch.
+    num_states_before: u64,
     /// What came from another node.
     fed: Option<Box<FedState>>,
 }
@@ -340,6 +342,7 @@ impl Rooms {
                 empty_since: Instant::now(),
                 is_home: self.others.is_none(),
                 epoch: 0,
+                num_states_before: 0,
                 fed: None,
             }),
             layout,
@@ -400,7 +403,8 @@ impl Rooms {
     pub fn newest(&self, name: &RoomName) -> Vec<Bytes> {
         let Some(room) = self.find(name) else { return Vec::new() };
         let state = lock(&room.state);
-        let Some(latest) = room.slot.borrow().clone().filter(|_| state.is_home) else { return Vec::new() };
+        let is_own = |latest: &Arc<Latest>| state.is_home && latest.key.index > state.num_states_before;
+        let Some(latest) = room.slot.borrow().clone().filter(is_own) else { return Vec::new() };
         let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
         let key = head(latest.key.index).message(&latest.key.bytes);
         latest.delta.iter().fold(vec![key], |mut messages, delta| {
@@ -413,7 +417,10 @@ impl Rooms {
     pub fn lead(&self, name: &RoomName, epoch: u64, sessions: u32) {
         let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
         let mut state = lock(&room.state);
-        (state.is_home, state.epoch) = (true, epoch);
+        if !std::mem::replace(&mut state.is_home, true) {
+            state.num_states_before = state.num_states;
+        }
+        state.epoch = epoch;
         state.num_sessions = state.num_sessions.max(sessions);
     }
 
