@@ -32,6 +32,10 @@ use wire::{EnterAnswer, EnterQuestion, Lease, LISTED_AT_ONCE, MOST_LISTED, NodeL
 
 /// Packets that wait for the connection to NATS; what finds no place is lost to other nodes, whose viewers see the next one.
 const MOST_WAITING: usize = 4096;
+/// Packets that have waited for longer are not sent: the next one says more.
+const OLD: Duration = Duration::from_millis(500);
+/// Messages that wait in the connection itself.
+const MOST_SENDING: usize = 512;
 /// How long NATS, or another node through it, may take to answer.
 const REQUEST_TIMEOUT: Duration = Duration::from_millis(300);
 /// How long NATS may take to make a bucket.
@@ -42,6 +46,9 @@ const FIRST_JOIN: Duration = Duration::from_secs(2);
 const GATHERING: Duration = Duration::from_secs(3);
 /// How often a node tells of itself and looks after its leases.
 const ROUND: Duration = Duration::from_millis(500);
+/// A node that has not heard itself for this long is cut off, whatever TCP thinks: NATS's own pings wait for as long as there is
+/// something to send.
+const DEAF: Duration = Duration::from_secs(2);
 /// A node that has told nothing for this long is not listed.
 const FORGOTTEN: Duration = Duration::from_secs(3);
 /// Nodes that are listed.
@@ -66,7 +73,7 @@ pub struct ClusterConfig {
     /// A file of NATS credentials (`.creds`).
     #[arg(long = "cluster-creds", value_name = "FILE.creds")]
     pub creds: Option<PathBuf>,
-    /// Authorities that NATS's certificate is trusted by, besides the system's.
+    /// Authorities that NATS's certificate is trusted by, instead of the system's.
     #[arg(long = "cluster-ca", value_name = "FILE.pem")]
     pub ca: Option<PathBuf>,
     /// A certificate that this node shows to NATS.
@@ -106,6 +113,7 @@ pub enum ClusterError {
 
 /// A packet on its way to other nodes.
 struct Outbound {
+    since: Instant,
     room: RoomName,
     message: Bytes,
 }
@@ -117,7 +125,7 @@ pub(crate) struct Outlet(mpsc::Sender<Outbound>);
 impl Outlet {
     /// Sends a packet without waiting; false where it found no place.
     pub fn send(&self, room: &RoomName, head: StateHead, packet: &[u8]) -> bool {
-        self.0.try_send(Outbound { room: room.clone(), message: head.message(packet) }).is_ok()
+        self.0.try_send(Outbound { since: Instant::now(), room: room.clone(), message: head.message(packet) }).is_ok()
     }
 }
 
@@ -171,6 +179,9 @@ pub(crate) struct Cluster {
     held: Mutex<HashMap<RoomName, Held>>,
     /// Rooms that trackers have asked for, which cannot wait.
     entering: Mutex<HashMap<RoomName, Entering>>,
+    /// When it last heard what it tells others, and whether that is too long ago.
+    heard_itself: Mutex<Instant>,
+    is_cut: std::sync::atomic::AtomicBool,
     /// The service ends: no room gets its home here.
     is_leaving: std::sync::atomic::AtomicBool,
     /// Rooms of which this node's viewers want to see something, as they come and go.
@@ -215,6 +226,7 @@ impl Cluster {
             .ping_interval(Duration::from_secs(1))
             .request_timeout(Some(REQUEST_TIMEOUT))
             .subscription_capacity(MOST_UNREAD)
+            .client_capacity(MOST_SENDING)
             .reconnect_delay_callback(|attempts| Duration::from_millis((50 * attempts as u64).min(1000)))
             .event_callback(move |event| {
                 match &event {
@@ -245,6 +257,8 @@ impl Cluster {
             buckets: OnceLock::new(),
             held: Mutex::default(),
             entering: Mutex::default(),
+            heard_itself: Mutex::new(Instant::now()),
+            is_cut: false.into(),
             is_leaving: false.into(),
             interest: watch::Sender::new(()),
             homes: watch::Sender::new(()),
@@ -266,6 +280,7 @@ impl Cluster {
     /// Why the node is on its own, if so.
     pub fn problem(&self) -> Option<&'static str> {
         match self.client.connection_state() {
+            State::Connected if self.is_cut.load(Ordering::SeqCst) => Some("NATS does not answer"),
             State::Connected if self.joined.borrow().0 == self.connection() => None,
             State::Connected => Some("NATS has no JetStream yet"),
             _ => Some("NATS is not reached"),
@@ -333,9 +348,10 @@ impl Cluster {
     }
 
     async fn send_packets(self: Arc<Self>, mut outbound: mpsc::Receiver<Outbound>) {
-        while let Some(Outbound { room, message }) = outbound.recv().await {
+        while let Some(Outbound { since, room, message }) = outbound.recv().await {
             // Without a connection it would only wait: by then it is old.
-            if self.client.connection_state() == State::Connected
+            if since.elapsed() < OLD
+                && self.client.connection_state() == State::Connected
                 && let Err(error) = self.client.publish(self.packets_of(&room), message).await
             {
                 tracing::debug!(%room, %error, "packet not sent to other nodes");
@@ -392,8 +408,13 @@ impl Cluster {
                     continue;
                 }
             };
+            if told.node == self.node {
+                *lock(&self.heard_itself) = Instant::now();
+                self.is_cut.store(false, Ordering::SeqCst);
+                continue;
+            }
             let mut nodes = lock(&self.nodes);
-            if told.node == self.node || (nodes.len() >= MOST_NODES && !nodes.contains_key(&told.node)) {
+            if nodes.len() >= MOST_NODES && !nodes.contains_key(&told.node) {
                 continue;
             }
             let known = nodes.entry(told.node).or_insert_with(|| Told { heard: Instant::now(), address: String::new(), parts: Vec::new() });
@@ -422,6 +443,8 @@ impl Cluster {
             let connection = self.connection();
             let is_new = self.joined.borrow().0 != connection;
             if is_new {
+                *lock(&self.heard_itself) = Instant::now();
+                self.is_cut.store(false, Ordering::SeqCst);
                 // Also where they were there before: NATS may have come back without them.
                 match tokio::time::timeout(BUCKET_TIMEOUT, self.make_buckets()).await {
                     Ok(Ok(buckets)) => drop(self.buckets.set(buckets)),
@@ -447,8 +470,21 @@ impl Cluster {
                 self.homes.send_replace(());
                 tracing::info!(node = self.node, "joined the cluster");
             }
-            self.renew(&rooms).await;
-            self.tell(&rooms).await;
+            if lock(&self.heard_itself).elapsed() >= DEAF {
+                *lock(&self.heard_itself) = Instant::now();
+                if !self.is_cut.swap(true, Ordering::SeqCst) {
+                    tracing::warn!("NATS does not answer: this node's own rooms go on");
+                }
+                if let Err(error) = self.client.force_reconnect().await {
+                    tracing::debug!(%error, "cannot connect anew");
+                }
+                continue;
+            }
+            if !self.is_cut.load(Ordering::SeqCst) {
+                self.renew(&rooms).await;
+            }
+            // Not for longer than a round, where nothing can be sent.
+            let _ = tokio::time::timeout(ROUND, self.tell(&rooms)).await;
         }
     }
 

@@ -158,7 +158,7 @@ mod linux {
         fn inside(namespace: &str, nats: &str, folder: &Path, address: &str) -> Self {
             let mut command = Command::new("ip");
             command.args(["netns", "exec", namespace, env!("CARGO_BIN_EXE_rhytid-server")]);
-            Self::spawn(command, nats, folder, &format!("{address}:0"), &["--insecure"])
+            Self::spawn(command, nats, folder, &format!("{address}:0"), &["--insecure", "--max-connection-rate", "1000"])
         }
 
         fn spawn(mut command: Command, nats: &str, folder: &Path, listen: &str, more: &[&str]) -> Self {
@@ -515,7 +515,7 @@ mod linux {
         socket.send(Message::text(r#"{"type":"settings"}"#)).unwrap();
         loop {
             match socket.read().unwrap() {
-                Message::Text(text) if text.contains("\"gains\"") => return serde_json::from_str(&text).unwrap(),
+                Message::Text(text) => return serde_json::from_str(&text).unwrap(),
                 Message::Close(frame) => panic!("{frame:?}"),
                 _ => {}
             }
@@ -536,7 +536,11 @@ mod linux {
         let mut sender = send(&feed, &[a, b, c], "demo", &log);
         let neutral_before = wait_for("a neutral", || neutral(&cluster.nodes[0], "demo"));
         // The settings of the feed have come, too.
-        wait_for("the settings", || (settings(&cluster.nodes[0], "demo")["gains"]["mouth"] == 0.75).then_some(()));
+        wait_for("the settings", || {
+            // So many may be asked for.
+            std::thread::sleep(Duration::from_millis(100));
+            (settings(&cluster.nodes[0], "demo")["gains"]["mouth"] == 0.75).then_some(())
+        });
         std::thread::sleep(Duration::from_millis(300));
         let session = watches[0].last().expect("it is seen").session;
 
@@ -709,18 +713,25 @@ mod linux {
     fn password_and_certificates() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name).display().to_string();
-        let made = rcgen::generate_simple_self_signed(["127.0.0.1".to_owned()]).unwrap();
-        std::fs::write(path("cert.pem"), made.cert.pem()).unwrap();
-        std::fs::write(path("key.pem"), made.signing_key.serialize_pem()).unwrap();
-        let (cert, key) = (path("cert.pem"), path("key.pem"));
+        let (authority_key, key) = (rcgen::KeyPair::generate().unwrap(), rcgen::KeyPair::generate().unwrap());
+        let mut authority = rcgen::CertificateParams::new([]).unwrap();
+        authority.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+        std::fs::write(path("ca.pem"), authority.self_signed(&authority_key).unwrap().pem()).unwrap();
+        let issuer = rcgen::Issuer::new(authority, authority_key);
+        let mut params = rcgen::CertificateParams::new(["127.0.0.1".to_owned()]).unwrap();
+        params.distinguished_name = rcgen::DistinguishedName::new();
+        let cert = params.signed_by(&key, &issuer).unwrap();
+        std::fs::write(path("cert.pem"), cert.pem()).unwrap();
+        std::fs::write(path("key.pem"), key.serialize_pem()).unwrap();
+        let (ca, cert, key) = (path("ca.pem"), path("cert.pem"), path("key.pem"));
         let nats = Nats::with(&["--tls", "--tlscert", &cert, "--tlskey", &key, "--user", "node", "--pass", "s3cret"]);
         let url = |word: &str| format!("tls://node:{word}@127.0.0.1:{}", nats.port);
-        let a = Node::with(&url("s3cret"), folder.path(), "127.0.0.1:0", &["--cluster-ca", &cert]).ready();
+        let a = Node::with(&url("s3cret"), folder.path(), "127.0.0.1:0", &["--cluster-ca", &ca]).ready();
         let mut publisher = a.publisher("demo", HELLO).ready();
         let watch = Watch::start(&[&a.address], "demo");
         publisher.frame(0.3);
         watch.wait_for_more("a face");
-        for (word, more) in [("wrong", &["--cluster-ca", &cert][..]), ("s3cret", &[])] {
+        for (word, more) in [("wrong", &["--cluster-ca", &ca][..]), ("s3cret", &[])] {
             let outside = Node::with(&url(word), folder.path(), "127.0.0.1:0", more);
             std::thread::sleep(Duration::from_millis(500));
             assert!(outside.get("/healthz").unwrap().starts_with("degraded"), "{word} {more:?}");
