@@ -20,15 +20,15 @@ use rhytid_shared::RoomName;
 use serde::Deserialize;
 use std::collections::HashMap;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, mpsc, watch};
 use tokio_tungstenite::tungstenite::Bytes;
 
 use lease::Entering;
+use wire::{EnterAnswer, EnterQuestion, LISTED_AT_ONCE, Lease, MOST_LISTED, NodeListing};
 pub(crate) use wire::{Kept, StateHead};
-use wire::{EnterAnswer, EnterQuestion, Lease, LISTED_AT_ONCE, MOST_LISTED, NodeListing};
 
 /// Packets that wait for the connection to NATS; what finds no place is lost to other nodes, whose viewers see the next one.
 const MOST_WAITING: usize = 4096;
@@ -46,9 +46,9 @@ const FIRST_JOIN: Duration = Duration::from_secs(2);
 const GATHERING: Duration = Duration::from_secs(3);
 /// How often a node tells of itself and looks after its leases.
 const ROUND: Duration = Duration::from_millis(500);
-/// A node that has not heard itself for this long is cut off, whatever TCP thinks: NATS's own pings wait for as long as there is
-/// something to send.
-const DEAF: Duration = Duration::from_secs(2);
+/// A node that has told something so often and has not heard itself is cut off, whatever TCP thinks: NATS's own pings wait for as
+/// long as there is something to send.
+const DEAF: u32 = 4;
 /// A node that has told nothing for this long is not listed.
 const FORGOTTEN: Duration = Duration::from_secs(3);
 /// Nodes that are listed.
@@ -179,11 +179,11 @@ pub(crate) struct Cluster {
     held: Mutex<HashMap<RoomName, Held>>,
     /// Rooms that trackers have asked for, which cannot wait.
     entering: Mutex<HashMap<RoomName, Entering>>,
-    /// When it last heard what it tells others, and whether that is too long ago.
-    heard_itself: Mutex<Instant>,
-    is_cut: std::sync::atomic::AtomicBool,
+    /// How often it has told others something since it has last heard that itself, and whether that is too often.
+    unheard: AtomicU32,
+    is_cut: AtomicBool,
     /// The service ends: no room gets its home here.
-    is_leaving: std::sync::atomic::AtomicBool,
+    is_leaving: AtomicBool,
     /// Rooms of which this node's viewers want to see something, as they come and go.
     interest: watch::Sender<()>,
     /// Rooms whose home has changed.
@@ -216,6 +216,12 @@ impl Cluster {
             options = options.add_client_certificate(cert.clone(), key.clone());
         }
         let servers: Vec<String> = url.split(',').map(|server| server.trim().to_owned()).collect();
+        // `async-nats` leaves them where they are.
+        options = match servers.iter().find_map(|server| login(server)) {
+            Some((user, Some(password))) => options.user_and_password(user, password),
+            Some((token, None)) => options.token(token),
+            None => options,
+        };
         let connections = Arc::new(Connections { made: AtomicU64::new(0), changed: Notify::new() });
         let counted = connections.clone();
         let client = options
@@ -257,7 +263,7 @@ impl Cluster {
             buckets: OnceLock::new(),
             held: Mutex::default(),
             entering: Mutex::default(),
-            heard_itself: Mutex::new(Instant::now()),
+            unheard: AtomicU32::new(0),
             is_cut: false.into(),
             is_leaving: false.into(),
             interest: watch::Sender::new(()),
@@ -409,7 +415,7 @@ impl Cluster {
                 }
             };
             if told.node == self.node {
-                *lock(&self.heard_itself) = Instant::now();
+                self.unheard.store(0, Ordering::SeqCst);
                 self.is_cut.store(false, Ordering::SeqCst);
                 continue;
             }
@@ -443,7 +449,7 @@ impl Cluster {
             let connection = self.connection();
             let is_new = self.joined.borrow().0 != connection;
             if is_new {
-                *lock(&self.heard_itself) = Instant::now();
+                self.unheard.store(0, Ordering::SeqCst);
                 self.is_cut.store(false, Ordering::SeqCst);
                 // Also where they were there before: NATS may have come back without them.
                 match tokio::time::timeout(BUCKET_TIMEOUT, self.make_buckets()).await {
@@ -470,8 +476,8 @@ impl Cluster {
                 self.homes.send_replace(());
                 tracing::info!(node = self.node, "joined the cluster");
             }
-            if lock(&self.heard_itself).elapsed() >= DEAF {
-                *lock(&self.heard_itself) = Instant::now();
+            if self.unheard.fetch_add(1, Ordering::SeqCst) >= DEAF {
+                self.unheard.store(0, Ordering::SeqCst);
                 if !self.is_cut.swap(true, Ordering::SeqCst) {
                     tracing::warn!("NATS does not answer: this node's own rooms go on");
                 }
@@ -555,6 +561,28 @@ fn node_id() -> String {
     format!("{:016x}", std::collections::hash_map::RandomState::new().build_hasher().finish())
 }
 
+/// User and password in an address of NATS, or a token alone.
+fn login(server: &str) -> Option<(String, Option<String>)> {
+    let rest = server.split_once("://").map_or(server, |(_, rest)| rest);
+    let (login, _) = rest.rsplit_once('@')?;
+    Some(match login.split_once(':') {
+        Some((user, password)) => (percent_decoded(user), Some(percent_decoded(password))),
+        None => (percent_decoded(login), None),
+    })
+}
+
+/// Text of a URL with its `%40` and the like (RFC 3986, 2.1) as they are meant.
+fn percent_decoded(text: &str) -> String {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.as_bytes();
+    while let Some((&first, behind)) = rest.split_first() {
+        let code = behind.get(..2).filter(|_| first == b'%').and_then(|two| u8::from_str_radix(std::str::from_utf8(two).ok()?, 16).ok());
+        bytes.push(code.unwrap_or(first));
+        rest = if code.is_some() { &behind[2..] } else { behind };
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
+}
+
 /// An address that may be logged.
 fn without_password(url: &str) -> String {
     let hide = |server: &str| match (server.find("://"), server.rfind('@')) {
@@ -572,5 +600,7 @@ mod tests {
     fn passwords_are_not_shown() {
         assert_eq!(without_password("nats://me:secret@a:4222,tls://b"), "nats://…@a:4222,tls://b");
         assert_ne!(node_id(), node_id());
+        assert_eq!(login("nats://me:s%40c:r%e%zz@a:4222"), Some(("me".into(), Some("s@c:r%e%zz".into()))));
+        assert_eq!((login("tls://word@a"), login("a:4222")), (Some(("word".into(), None)), None));
     }
 }

@@ -56,7 +56,8 @@ mod linux {
             trial("rolling_restart_under_load_is_hardly_seen", rolling_restart),
             trial("tracker_over_udp_holds_its_room_before_all_nodes", tracker_over_udp),
             trial("password_and_certificates_of_nats_are_passed_through", password_and_certificates),
-            trial("node_whose_link_is_cut_goes_on_alone_and_joins_again", cut_link).with_ignored_flag(!has_nats || !Namespace::is_possible()),
+            trial("node_whose_link_is_cut_goes_on_alone_and_joins_again", cut_link)
+                .with_ignored_flag(!has_nats || !Namespace::is_possible()),
         ];
         libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
     }
@@ -762,7 +763,8 @@ mod linux {
             let number = (std::process::id() + 7 * NEXT.fetch_add(1, Ordering::Relaxed)) % 250;
             let name = format!("rhytid{number}");
             // Addresses for tests of networks: RFC 2544.
-            let cable = |k: u32| (format!("rhy{number}-{k}"), format!("198.18.{number}.{}", 1 + 4 * k), format!("198.18.{number}.{}", 2 + 4 * k));
+            let cable =
+                |k: u32| (format!("rhy{number}-{k}"), format!("198.18.{number}.{}", 1 + 4 * k), format!("198.18.{number}.{}", 2 + 4 * k));
             let namespace = Self { name, cables: [cable(0), cable(1)] };
             let is_made = ip(&format!("netns add {}", namespace.name))
                 && namespace.cables.iter().all(|(cable, here, there)| {
