@@ -35,7 +35,7 @@ mod linux {
     const HELLO: &str = r#"{"type":"hello","version":1,"source":"test","fps":60}"#;
 
     pub fn main() -> ExitCode {
-        let has_nats = Command::new("nats-server").arg("--version").stdout(Stdio::null()).status().is_ok();
+        let has_nats = nats_server().arg("--version").stdout(Stdio::null()).status().is_ok();
         if !has_nats {
             println!("no nats-server on this machine (Debian: apt-get install nats-server): the cluster's tests are ignored");
         }
@@ -60,6 +60,12 @@ mod linux {
                 .with_ignored_flag(!has_nats || !Namespace::is_possible()),
         ];
         libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+    }
+
+    /// Debian puts it where only root's path leads.
+    fn nats_server() -> Command {
+        let path = Path::new("/usr/sbin/nats-server");
+        Command::new(if path.is_file() { path } else { Path::new("nats-server") })
     }
 
     fn free_port() -> u16 {
@@ -117,7 +123,7 @@ mod linux {
 
         fn at(port: u16, folder: Arc<tempfile::TempDir>, more: Vec<String>) -> Self {
             let address = more.iter().skip_while(|word| *word != "-a").nth(1).map_or("127.0.0.1", String::as_str).to_owned();
-            let child = Command::new("nats-server")
+            let child = nats_server()
                 .args(["-js", "-p", &port.to_string(), "-sd"])
                 .arg(folder.path())
                 .args(if more.iter().any(|word| word == "-a") { &[][..] } else { &["-a", "127.0.0.1"] })

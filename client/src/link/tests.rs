@@ -489,3 +489,47 @@ fn way_is_measured_and_a_dropped_link_says_goodbye() {
     drop(link);
     assert!(reader.join().unwrap(), "the server must see a close frame");
 }
+
+/// Options for two nodes of a cluster.
+fn two_nodes(first: &TestServer, second: &TestServer) -> LinkOptions {
+    let address = |server: &TestServer| server.listener.local_addr().unwrap();
+    let servers = format!("ws://{},ws://{}", address(first), address(second)).parse().unwrap();
+    LinkOptions { servers, ..first.options("a") }
+}
+
+#[test]
+fn link_goes_on_at_the_next_node_at_once_when_one_breaks() {
+    let (first, second) = (TestServer::start(), TestServer::start());
+    let mut link = Link::open(two_nodes(&first, &second), || ());
+    let mut socket = first.accept();
+    send_hello(&mut socket, &hello("a"));
+    wait_for("the hello", || link.take_news().connected);
+    let broken_at = Instant::now();
+    drop(socket);
+    let mut socket = second.accept();
+    send_hello(&mut socket, &hello("a"));
+    socket.send(Message::binary(packets(1).remove(0))).unwrap();
+    frames(&mut link, 1);
+    assert!(broken_at.elapsed() < Duration::from_millis(500), "{:?}", broken_at.elapsed());
+    assert_eq!(link.stats().connects, 2);
+    // And back again.
+    drop(socket);
+    send_hello(&mut first.accept(), &hello("a"));
+    wait_for("the third hello", || (link.stats().connects == 3).then_some(()));
+}
+
+#[test]
+fn link_leaves_a_node_that_falls_silent_within_two_seconds() {
+    let (first, second) = (TestServer::start(), TestServer::start());
+    let mut link = Link::open(two_nodes(&first, &second), || ());
+    // Stopped: the connection stands, and nothing is ever read or sent.
+    let mut stopped = first.accept();
+    send_hello(&mut stopped, &hello("a"));
+    wait_for("the hello", || link.take_news().connected);
+    let stopped_at = Instant::now();
+    let mut socket = second.accept();
+    send_hello(&mut socket, &hello("a"));
+    socket.send(Message::binary(packets(1).remove(0))).unwrap();
+    frames(&mut link, 1);
+    assert!(stopped_at.elapsed() < Duration::from_secs(2), "{:?}", stopped_at.elapsed());
+}
