@@ -466,10 +466,9 @@ impl Cluster {
                 // What it has of them may be older than what is held.
                 lock(&self.held).values_mut().for_each(|held| held.revision = None);
             }
-            if is_new || watching.as_ref().is_none_or(tokio::task::JoinHandle::is_finished) {
-                if let Some(watching) = watching.replace(tokio::spawn(self.clone().watch_leases(Arc::downgrade(&rooms)))) {
-                    watching.abort();
-                }
+            let is_watching = !is_new && watching.as_ref().is_some_and(|watching| !watching.is_finished());
+            if !is_watching && let Some(before) = watching.replace(tokio::spawn(self.clone().watch_leases(Arc::downgrade(&rooms)))) {
+                before.abort();
             }
             if is_new {
                 self.joined.send_replace((connection, Instant::now()));

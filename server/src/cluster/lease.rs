@@ -150,14 +150,20 @@ impl Cluster {
     }
 
     async fn claim(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Result<(), LeaseError> {
-        let Some(buckets) = self.buckets.get().filter(|_| self.problem().is_none()) else { return Ok(self.hold_alone(rooms, room)) };
+        let Some(buckets) = self.buckets.get().filter(|_| self.problem().is_none()) else {
+            self.hold_alone(rooms, room);
+            return Ok(());
+        };
         let question = EnterQuestion { room: room.to_string(), takeover: hello.takeover, resume: hello.resume };
         for _ in 0..MOST_TRIES {
             let entry = match within(buckets.leases.entry(room.as_str())).await {
                 Some(Ok(entry)) => entry,
                 Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
                 // NATS has gone in this moment.
-                None => return Ok(self.hold_alone(rooms, room)),
+                None => {
+                    self.hold_alone(rooms, room);
+                    return Ok(());
+                }
             };
             let found = entry.filter(|entry| entry.operation == Operation::Put);
             let found = found.and_then(|entry| Some((entry.revision, serde_json::from_slice::<Lease>(&entry.value).ok()?)));
@@ -172,13 +178,19 @@ impl Cluster {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => continue,
                     Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                    None => return Ok(self.hold_alone(rooms, room)),
+                    None => {
+                        self.hold_alone(rooms, room);
+                        return Ok(());
+                    }
                 },
                 None => match within(buckets.leases.create(room.as_str(), text_of(&lease))).await {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == CreateErrorKind::AlreadyExists => continue,
                     Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                    None => return Ok(self.hold_alone(rooms, room)),
+                    None => {
+                        self.hold_alone(rooms, room);
+                        return Ok(());
+                    }
                 },
             };
             rooms.forget_kept(room);
