@@ -8,7 +8,7 @@ pub mod twin;
 
 #[cfg(not(target_arch = "wasm32"))]
 mod native {
-    pub use crate::link::{Link, LinkOptions, LinkState, LinkStats, ServerAddress};
+    pub use crate::link::{Link, LinkOptions, LinkState, LinkStats, ServerAddress, ServerAddresses};
     pub use crate::renderer::{Headless, RenderError};
     pub use crate::spectator::{Spectator, Status, StatusKind};
     pub use crate::video::{Video, VideoError};

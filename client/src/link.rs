@@ -10,7 +10,7 @@ mod inbox;
 mod tests;
 mod wire;
 
-pub use address::{AddressError, ServerAddress};
+pub use address::{AddressError, ServerAddress, ServerAddresses};
 pub(crate) use fetch::agent;
 pub use inbox::{FrameArrival, LinkNews};
 
@@ -27,8 +27,8 @@ use std::time::{Duration, Instant};
 /// What to watch.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LinkOptions {
-    /// Where.
-    pub server: ServerAddress,
+    /// Where; where there are several, the next one is tried at once when a connection is lost.
+    pub servers: ServerAddresses,
     /// Which room.
     pub room: RoomName,
     /// Whom to trust where the server is encrypted.
@@ -150,28 +150,35 @@ impl Drop for Link {
 
 fn run(mut options: LinkOptions, inbox: &Inbox, wake: &dyn Fn()) {
     let (mut backoff, mut fetch_backoff) = (Backoff::of_connections(), Backoff::of_fetches());
+    let num_servers = options.servers.all().len();
+    let (mut at, mut num_in_vain) = (0, 0);
     while !inbox.is_stopped() {
         let started_at = Instant::now();
         let connects = inbox.stats().connects;
-        let ended = connection::watch(&mut options, inbox, wake);
+        let server = options.servers.all()[at].clone();
+        let ended = connection::watch(&mut options, &server, inbox, wake);
+        at = (at + 1) % num_servers;
         if inbox.stats().connects > connects {
             fetch_backoff = Backoff::of_fetches();
+            num_in_vain = 0;
         }
+        num_in_vain += 1;
         let state = match ended {
             Ended::Stopped => return,
             Ended::Refused(message) => {
-                tracing::warn!(server = %options.server, room = %options.room, message, "refused");
+                tracing::warn!(server = %server, room = %options.room, message, "refused");
                 LinkState::Refused { message }
             }
             Ended::Lost(why) => {
-                let pause = backoff.next_pause(started_at.elapsed());
-                tracing::debug!(server = %options.server, why, ?pause, "connection lost");
+                // Another node may be there while this one is not; a pause comes when none was.
+                let pause = if num_in_vain < num_servers { Duration::ZERO } else { backoff.next_pause(started_at.elapsed()) };
+                tracing::debug!(server = %server, why, ?pause, "connection lost");
                 LinkState::Lost { why, retry_at: Instant::now() + pause, attempts: backoff.failures() }
             }
             Ended::NoCharacter(why) => {
                 // However long the transfer took, it was no good connection.
                 let pause = fetch_backoff.next_pause(Duration::ZERO);
-                tracing::warn!(server = %options.server, why, ?pause, "no character");
+                tracing::warn!(server = %server, why, ?pause, "no character");
                 LinkState::Lost { why, retry_at: Instant::now() + pause, attempts: fetch_backoff.failures() }
             }
         };

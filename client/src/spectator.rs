@@ -1,6 +1,6 @@
 //! A viewer without a picture: link and playout together, and in plain words how things stand.
 
-use crate::link::{CharacterSource, Link, LinkOptions, LinkState, LinkStats, ServerAddress};
+use crate::link::{CharacterSource, Link, LinkOptions, LinkState, LinkStats, ServerAddresses};
 use crate::playout::{Playout, PlayoutState, PlayoutStats};
 use crate::renderer::RenderFrame;
 use rhytid_shared::trust::Trust;
@@ -11,9 +11,9 @@ use std::time::{Duration, Instant};
 /// Whom to watch.
 #[derive(Debug, Clone, PartialEq, Eq, clap::Args)]
 pub struct WatchArgs {
-    /// The server
-    #[arg(default_value = "ws://127.0.0.1:7878", value_name = "ws[s]://HOST[:PORT]")]
-    pub server: ServerAddress,
+    /// The server, or nodes of a cluster with commas between them: when one is lost, the next is asked
+    #[arg(default_value = "ws://127.0.0.1:7878", value_name = "ws[s]://HOST[:PORT][,…]")]
+    pub servers: ServerAddresses,
     /// The room
     #[arg(long, default_value = "demo", value_parser = RoomName::new)]
     pub room: RoomName,
@@ -65,7 +65,7 @@ pub struct Spectator {
     link: Link,
     playout: Playout,
     character: Arc<Character>,
-    server: ServerAddress,
+    servers: ServerAddresses,
     room: RoomName,
     /// Zero of the playout's time.
     started_at: Instant,
@@ -111,15 +111,15 @@ impl Spectator {
     /// Starts watching. `character` is the one that is there already; `wake` is called on the link's thread whenever
     /// something came.
     pub fn open(watch: WatchArgs, character: Arc<Character>, wake: impl Fn() + Send + 'static) -> Self {
-        let WatchArgs { server, room, trust, token } = watch;
+        let WatchArgs { servers, room, trust, token } = watch;
         let token = token.token();
         let known_sha256 = Some(character.sha256.clone());
-        let options = LinkOptions { server: server.clone(), room: room.clone(), trust, token, known_sha256 };
+        let options = LinkOptions { servers: servers.clone(), room: room.clone(), trust, token, known_sha256 };
         Self {
             link: Link::open(options, wake),
             playout: Playout::new(&character),
             character,
-            server,
+            servers,
             room,
             started_at: Instant::now(),
             unusable: None,
@@ -155,24 +155,24 @@ impl Spectator {
 
     /// How things stand at `now`, as of the last [`Spectator::sample`].
     pub fn status(&self, now: Instant) -> Status {
-        let Self { server, room, .. } = self;
+        let Self { servers, room, .. } = self;
         let status = |kind, headline, detail| Status { kind, headline, detail };
         match (self.link.state(), self.playout.state()) {
             (LinkState::Refused { message }, _) => status(StatusKind::Refused, "Refused", message),
-            (LinkState::Connecting, _) => status(StatusKind::Connecting, "Connecting", format!("Looking for {server}")),
+            (LinkState::Connecting, _) => status(StatusKind::Connecting, "Connecting", format!("Looking for {servers}")),
             (LinkState::Lost { why, retry_at, attempts }, _) => {
                 let left = retry_at.saturating_duration_since(now).as_secs_f32().ceil();
                 let again = if attempts > 1 { format!("attempt {attempts} failed, trying again") } else { "trying again".into() };
                 let next = if left > 0.0 { format!("{again} in {left} s") } else { again };
-                status(StatusKind::ServerGone, "Server gone", format!("{server}: {why}; {next}"))
+                status(StatusKind::ServerGone, "Server gone", format!("{servers}: {why}; {next}"))
             }
             (LinkState::Live, _) if self.unusable.is_some() => {
                 status(StatusKind::Unusable, "Cannot draw this character", self.unusable.clone().unwrap_or_default())
             }
             (LinkState::Live, PlayoutState::Waiting) => {
-                status(StatusKind::Waiting, "Waiting for a face", format!("Nobody publishes to room {room} of {server} yet"))
+                status(StatusKind::Waiting, "Waiting for a face", format!("Nobody publishes to room {room} of {servers} yet"))
             }
-            (LinkState::Live, PlayoutState::Live) => status(StatusKind::Live, "Live", format!("Room {room} of {server}")),
+            (LinkState::Live, PlayoutState::Live) => status(StatusKind::Live, "Live", format!("Room {room} of {servers}")),
             (LinkState::Live, PlayoutState::FaceLost) => {
                 status(StatusKind::FaceLost, "Face lost", "The tracker is there but sees no face".into())
             }

@@ -131,7 +131,8 @@ pub fn run(args: ViewArgs) -> Result<(), WindowError> {
     // The event loop is gone only when the window is.
     let wake = move || drop(proxy.send_event(Wake));
     let token = args.watch.token.clone().token();
-    let remote = Remote::open(&args.watch.server, &args.watch.room, &args.watch.trust, token, wake.clone());
+    // Recordings stay with the node that made them: the first one is asked.
+    let remote = Remote::open(args.watch.servers.first(), &args.watch.room, &args.watch.trust, token, wake.clone());
     let mut app = App {
         remote,
         spectator: Spectator::open(args.watch, Arc::clone(&character), wake),

@@ -1,5 +1,6 @@
 //! What a user may set: the listening address, the character, every limit and every time-out.
 
+use crate::cluster::ClusterConfig;
 use crate::recording::RecordConfig;
 use crate::service::Play;
 use crate::solve::SolveConfig;
@@ -84,6 +85,8 @@ pub struct ServerConfig {
     pub vmc_out: Vec<VmcOutSpec>,
     /// Folder of performers' profiles, read when the service starts and written when a fit ends.
     pub profiles: Option<PathBuf>,
+    /// Other nodes.
+    pub cluster: ClusterConfig,
     /// How much of everything.
     pub limits: Limits,
     /// How long for everything.
@@ -109,6 +112,7 @@ impl Default for ServerConfig {
             listen_udp: Vec::new(),
             vmc_out: Vec::new(),
             profiles: None,
+            cluster: ClusterConfig::default(),
             limits: Limits::default(),
             timeouts: Timeouts::default(),
             access: Access::default(),

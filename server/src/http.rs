@@ -6,7 +6,7 @@ use crate::config::Access;
 use crate::service::{Hub, Peer, Place};
 use crate::socket::{Ending, ErrorMessage, Handshake, close, tokens, upgrade};
 use crate::token::{Claims, Refusal, Role, now_seconds};
-use crate::{control, page, publish, viewer};
+use crate::{control, page, publish, room, viewer};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{Path, Request, State};
@@ -26,7 +26,7 @@ use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 pub(crate) fn router(hub: Arc<Hub>) -> Router {
     Router::new()
         .route("/", get(start_page))
-        .route("/healthz", get(async || "ok\n"))
+        .route("/healthz", get(health))
         .route("/metrics", get(metrics))
         .route("/api/access", get(access))
         .route("/api/rooms", get(rooms))
@@ -221,14 +221,28 @@ async fn metrics(State(hub): State<Arc<Hub>>, request: Request) -> Response {
     ([(header::CONTENT_TYPE, kind)], text).into_response()
 }
 
-/// All rooms, for who may do everything; or the one that the query names, for who may watch it.
+/// `ok`, or what this node lacks of its cluster: its own rooms go on, so it is healthy all the same.
+async fn health(State(hub): State<Arc<Hub>>) -> String {
+    match hub.cluster.as_ref().and_then(|cluster| cluster.problem()) {
+        Some(problem) => format!("degraded: {problem}\n"),
+        None => "ok\n".to_owned(),
+    }
+}
+
+/// All rooms, for who may do everything; or the one that the query names, for who may watch it. Where there are other nodes,
+/// theirs, too: each room once, as its home tells of it.
 async fn rooms(State(hub): State<Arc<Hub>>, request: Request) -> Response {
-    let rooms = match admit_to_listing(&hub, &request, Role::View) {
-        Ok(Some(name)) => hub.rooms.find(&name).iter().map(|room| room.listing()).collect(),
-        Ok(None) => hub.rooms.list(),
+    let asked = match admit_to_listing(&hub, &request, Role::View) {
+        Ok(asked) => asked,
         Err(answer) => return *answer,
     };
-    axum::Json(serde_json::json!({ "rooms": rooms })).into_response()
+    let own = match &asked {
+        Some(name) => hub.rooms.find(name).iter().map(|room| room.listing()).collect(),
+        None => hub.rooms.list(),
+    };
+    let Some(cluster) = &hub.cluster else { return axum::Json(serde_json::json!({ "rooms": own })).into_response() };
+    let rooms = room::merge(cluster.node(), own, cluster.elsewhere(asked.as_ref()));
+    axum::Json(serde_json::json!({ "node": cluster.node(), "nodes": cluster.nodes(), "rooms": rooms })).into_response()
 }
 
 /// Lets in who may see a listing: of the room that the query names, as `role`, or of all there is.

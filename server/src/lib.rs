@@ -7,6 +7,7 @@
 
 mod answer;
 mod clip;
+mod cluster;
 mod config;
 mod control;
 pub mod feed;
@@ -35,6 +36,7 @@ pub mod trackers;
 mod viewer;
 
 pub use clip::{Clip, ClipError, ClipReader};
+pub use cluster::{ClusterConfig, ClusterError};
 pub use config::{Access, Limits, ServerConfig, ServerConfigError, Timeouts, Tls};
 pub use fit::{FitCliError, Guide, LiveFit, StepAt, fit_feed, fit_live, write_profile};
 pub use profiles::ProfileError;

@@ -10,8 +10,8 @@ use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use rhytid_server::recording::RecordConfig;
 use rhytid_server::{
-    Access, Clip, FakeKind, FakeOptions, Guide, Identity, Limits, ListenSpec, LiveFit, SendOptions, SendReport, SendSource, ServerConfig,
-    StepAt, Timeouts, Tls, VmcOutSpec, bind, fake, fit_feed, fit_live, load_character, run, send, write_profile,
+    Access, Clip, ClusterConfig, FakeKind, FakeOptions, Guide, Identity, Limits, ListenSpec, LiveFit, SendOptions, SendReport, SendSource,
+    ServerConfig, StepAt, Timeouts, Tls, VmcOutSpec, bind, fake, fit_feed, fit_live, load_character, run, send, write_profile,
 };
 use rhytid_shared::trust::Trust;
 use rhytid_shared::{Character, FIT_SECONDS, FitStep, Profile, ProfileChoice, RoomName, Settings, Slot};
@@ -92,6 +92,8 @@ struct ServeArgs {
     #[arg(long, value_name = "DIR")]
     profiles: Option<PathBuf>,
     #[command(flatten)]
+    cluster: ClusterConfig,
+    #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
     timeouts: Timeouts,
@@ -114,8 +116,8 @@ struct SendArgs {
     /// The character that has the clip, instead of the built-in one.
     #[arg(long, value_name = "FILE.glb", requires = "clip")]
     character: Option<PathBuf>,
-    /// The server.
-    #[arg(long, default_value = "ws://127.0.0.1:7878", value_name = "URL")]
+    /// The server, or nodes of a cluster with commas between them: when one is lost, the face goes on at the next.
+    #[arg(long, default_value = "ws://127.0.0.1:7878", value_name = "URL[,URL…]")]
     to: String,
     /// The room.
     #[arg(long, default_value = "demo")]
@@ -338,6 +340,10 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
     }
     config.character = args.character.or(config.character);
     config.profiles = args.profiles.or(config.profiles);
+    // Given by flags it is whole, whatever the file says.
+    if args.cluster != ClusterConfig::default() {
+        config.cluster = args.cluster;
+    }
     config.listen_udp.extend(args.listen_udp);
     config.vmc_out.extend(args.vmc_out);
     config.access.hosts.extend(args.access.hosts);

@@ -52,6 +52,9 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName, pass: &Pass) -
             Err(_) => return Err(refusal("hello_timeout", format!("no hello within {} seconds", timeouts.hello))),
         },
     };
+    if let Some(cluster) = &hub.cluster {
+        cluster.enter(&hub.rooms, room, &hello).await.map_err(|error| refusal(error.code(), error.to_string()))?;
+    }
     let (source, evicted) = Source::open(hub, room, hello, Some(text)).map_err(not_opened)?;
     let heard = Heard::now();
     let mut session = Session::new(hub, pass, source, reader);
@@ -245,7 +248,10 @@ fn not_opened(error: OpenError) -> Stop {
         OpenError::Room(refused) => {
             let code = match refused {
                 RoomError::Taken | RoomError::SlotTaken => CloseCode::Policy,
-                RoomError::TooManyRooms { .. } | RoomError::TooManyViewers { .. } | RoomError::TooManySlots { .. } => CloseCode::Again,
+                RoomError::TooManyRooms { .. }
+                | RoomError::TooManyViewers { .. }
+                | RoomError::TooManySlots { .. }
+                | RoomError::Elsewhere => CloseCode::Again,
             };
             Ending::error(code, ErrorMessage::new(refused.code(), refused.to_string())).into()
         }

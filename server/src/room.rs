@@ -1,14 +1,14 @@
 //! Rooms: where one publisher's packets meet any number of viewers. A room holds one state, the newest; nothing queues.
 
+use crate::cluster::{Kept, Outlet, StateHead};
 use crate::metrics::Metrics;
 use crate::recording::{Item, RecordError, Recorder, RecorderStatus, SessionEvent, Sink};
-use crate::solve::Calibration;
 use crate::solve::mix::Mixer;
 use crate::source::Control;
 use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
-use rhytid_shared::{ChannelGroup, Character, FaceFrame, PublishHello, RoomName, Slot};
-use serde::Serialize;
+use rhytid_shared::{ChannelGroups, Character, FaceFrame, PublishHello, RoomName, Slot};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
@@ -38,7 +38,7 @@ impl Latest {
         let make = || {
             let (mut decoder, mut frame) = (Decoder::new(layout.clone()), layout.frame_at_rest());
             for packet in [Some(&self.key.bytes), self.delta.as_ref()].into_iter().flatten() {
-                decoder.decode(packet, &mut frame).expect("a packet of the room's own encoder can be read");
+                decoder.decode(packet, &mut frame).expect("it comes from the room's own encoder, or was read when it came");
             }
             let message = ViewMessage::Frame(JsonFrame::new(&frame, character));
             serde_json::to_string(&message).expect("plain data can be written").into()
@@ -60,6 +60,8 @@ pub(crate) enum RoomError {
     SlotTaken,
     #[error("the room has {most} sources already, which is the limit")]
     TooManySlots { most: usize },
+    #[error("another node has become the room's home in this moment; try again")]
+    Elsewhere,
 }
 
 impl RoomError {
@@ -71,6 +73,7 @@ impl RoomError {
             Self::Taken => "room_taken",
             Self::SlotTaken => "slot_taken",
             Self::TooManySlots { .. } => "too_many_slots",
+            Self::Elsewhere => "room_elsewhere",
         }
     }
 }
@@ -87,12 +90,14 @@ pub(crate) struct SlotClaim {
     pub source: String,
     /// Take the slot over from another publisher.
     pub takeover: bool,
+    /// Take it over from this session, which was the claimant's own.
+    pub resume: Option<u32>,
 }
 
 impl SlotClaim {
     /// As a hello says it.
     pub fn of(hello: &PublishHello) -> Self {
-        Self { slot: hello.slot.clone(), source: hello.source.clone(), takeover: hello.takeover }
+        Self { slot: hello.slot.clone(), source: hello.source.clone(), takeover: hello.takeover, resume: hello.resume }
     }
 }
 
@@ -104,6 +109,16 @@ pub(crate) struct Rooms {
     max_viewers: usize,
     metrics: Arc<Metrics>,
     recorder: Arc<Recorder>,
+    /// Other nodes.
+    others: Option<Others>,
+}
+
+/// What rooms need of other nodes.
+pub(crate) struct Others {
+    /// Where packets leave for them.
+    pub outlet: Outlet,
+    /// Told when a room's viewers come or go.
+    pub interest: watch::Sender<()>,
 }
 
 /// One room.
@@ -115,6 +130,8 @@ pub(crate) struct Room {
     since: Instant,
     layout: PacketLayout,
     metrics: Arc<Metrics>,
+    outlet: Option<Outlet>,
+    interest: Option<watch::Sender<()>>,
 }
 
 struct RoomState {
@@ -137,14 +154,42 @@ struct RoomState {
     /// What keeps its messages, also where that has failed.
     recording: Option<Arc<Sink>>,
     empty_since: Instant,
+    /// This node is the room's home; where there are no others it always is.
+    is_home: bool,
+    /// Epoch under which packets leave for other nodes; what comes under an older one is old.
+    epoch: u64,
+    /// States that came before this node was the room's home: they are of another epoch.
+    num_states_before: u64,
+    /// What came from another node.
+    fed: Option<Box<FedState>>,
+}
+
+/// The newest state that came from another node.
+struct FedState {
+    head: StateHead,
+    /// Epoch and index of the key packet that its deltas need.
+    key: (u64, u64),
+    decoder: Decoder,
+    frame: FaceFrame,
+}
+
+/// What became of another node's packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Fed {
+    /// It is the room's newest state.
+    Taken,
+    /// It is no newer than what has been shown, or this node is the home.
+    Old,
+    /// It needs a key packet that did not come.
+    NeedsKey,
+    /// It cannot be read.
+    Broken,
 }
 
 /// The neutral face that a session came to: kept so that a publisher which comes back need not be searched again.
 struct Neutral {
     session: u32,
-    /// Whose it is.
-    hello: PublishHello,
-    calibration: Calibration,
+    kept: Kept,
 }
 
 struct Publisher {
@@ -158,9 +203,9 @@ struct Publisher {
 }
 
 /// A room as `/api/rooms` lists it.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RoomListing {
-    name: String,
+    pub name: String,
     viewers: usize,
     /// Publishers the room has had.
     session: u32,
@@ -174,33 +219,33 @@ pub(crate) struct RoomListing {
     recording: Option<RecorderStatus>,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct PublisherListing {
     source: String,
     seconds: f64,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct SourceListing {
     slot: String,
     source: String,
     priority: u8,
-    groups: Vec<&'static str>,
+    groups: Vec<String>,
     /// It has shown a face in the last half second.
     live: bool,
     /// The groups it drives now.
-    drives: Vec<&'static str>,
+    drives: Vec<String>,
     seconds: f64,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct FrameListing {
     seq: u32,
     t: f64,
     face: bool,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct NeutralListing {
     /// The session that came to it, and the time on its sender's clock, seconds.
     session: u32,
@@ -211,14 +256,25 @@ struct NeutralListing {
     requested: bool,
 }
 
+fn names_of(groups: ChannelGroups) -> Vec<String> {
+    groups.iter().map(|group| group.name().to_owned()).collect()
+}
+
 /// A lock that a panicking holder left is still whole: every change under it is complete at each step.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 impl Rooms {
-    pub fn new(character: Arc<Character>, max_rooms: usize, max_viewers: usize, metrics: Arc<Metrics>, recorder: Arc<Recorder>) -> Self {
-        Self { character, by_name: Mutex::default(), max_rooms, max_viewers, metrics, recorder }
+    pub fn new(
+        character: Arc<Character>,
+        max_rooms: usize,
+        max_viewers: usize,
+        metrics: Arc<Metrics>,
+        recorder: Arc<Recorder>,
+        others: Option<Others>,
+    ) -> Self {
+        Self { character, by_name: Mutex::default(), max_rooms, max_viewers, metrics, recorder, others }
     }
 
     /// Enters a room as a viewer; the room is made where there is none.
@@ -232,6 +288,9 @@ impl Rooms {
         state.num_viewers += 1;
         drop(state);
         self.metrics.viewers.inc();
+        if let Some(interest) = &room.interest {
+            interest.send_replace(());
+        }
         Ok(Viewing { slot: room.slot.subscribe(), room })
     }
 
@@ -248,9 +307,12 @@ impl Rooms {
         let mut by_name = lock(&self.by_name);
         let room = self.find_or_make(&mut by_name, name)?;
         let mut state = lock(&room.state);
+        if !state.is_home {
+            return Err(RoomError::Elsewhere);
+        }
         let before = state.publishers.iter().position(|publisher| publisher.claim.slot.name == claim.slot.name);
         match before {
-            Some(_) if !claim.takeover => {
+            Some(at) if !claim.takeover && claim.resume != Some(state.publishers[at].session) => {
                 return Err(if claim.slot.name == Slot::MAIN { RoomError::Taken } else { RoomError::SlotTaken });
             }
             None if state.publishers.len() >= MAX_SLOTS => return Err(RoomError::TooManySlots { most: MAX_SLOTS }),
@@ -324,9 +386,15 @@ impl Rooms {
                 neutrals: BTreeMap::new(),
                 recording: None,
                 empty_since: Instant::now(),
+                is_home: self.others.is_none(),
+                epoch: 0,
+                num_states_before: 0,
+                fed: None,
             }),
             layout,
             metrics: self.metrics.clone(),
+            outlet: self.others.as_ref().map(|others| others.outlet.clone()),
+            interest: self.others.as_ref().map(|others| others.interest.clone()),
         });
         by_name.insert(name.clone(), room.clone());
         self.metrics.rooms.set(by_name.len() as i64);
@@ -338,11 +406,104 @@ impl Rooms {
         lock(&self.by_name).get(name).cloned()
     }
 
-    /// The neutral face that the room keeps, for the slot of `hello`, of its tracker.
-    pub fn neutral(&self, name: &RoomName, hello: &PublishHello) -> Option<Calibration> {
+    /// What the room keeps for the slot of `hello`, of its tracker.
+    pub fn kept(&self, name: &RoomName, hello: &PublishHello) -> Option<Kept> {
         let room = self.find(name)?;
         let state = lock(&room.state);
-        state.neutrals.get(&hello.slot.name).filter(|kept| kept.hello.is_of_same_tracker(hello)).map(|kept| kept.calibration.clone())
+        state.neutrals.get(&hello.slot.name).filter(|neutral| neutral.kept.tracker == hello.tracker()).map(|neutral| neutral.kept.clone())
+    }
+
+    /// True where something is kept of a room's slot.
+    pub fn has_kept(&self, name: &RoomName, slot: &str) -> bool {
+        self.find(name).is_some_and(|room| lock(&room.state).neutrals.contains_key(slot))
+    }
+
+    /// Takes over what other nodes keep of a room's slot.
+    pub fn restore(&self, name: &RoomName, slot: &str, kept: Kept) {
+        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
+        let mut state = lock(&room.state);
+        if state.neutrals.len() < MAX_SLOTS || state.neutrals.contains_key(slot) {
+            state.neutrals.insert(slot.to_owned(), Neutral { session: 0, kept });
+        }
+    }
+
+    /// Forgets what is kept of a room: another node, which was its home, knows better.
+    pub fn forget_kept(&self, name: &RoomName) {
+        if let Some(room) = self.find(name) {
+            lock(&room.state).neutrals.clear();
+        }
+    }
+
+    /// Slots of a room that are taken, each with its session.
+    pub fn slots(&self, name: &RoomName) -> Vec<(String, u32)> {
+        let Some(room) = self.find(name) else { return Vec::new() };
+        lock(&room.state).publishers.iter().map(|publisher| (publisher.claim.slot.name.clone(), publisher.session)).collect()
+    }
+
+    /// The greatest number that a session of a room has had, as far as is known here.
+    pub fn num_sessions(&self, name: &RoomName) -> u32 {
+        self.find(name).map_or(0, |room| lock(&room.state).num_sessions)
+    }
+
+    /// A room's newest state as messages for another node: the key packet, and the delta where there is one.
+    pub fn newest(&self, name: &RoomName) -> Vec<Bytes> {
+        let Some(room) = self.find(name) else { return Vec::new() };
+        let state = lock(&room.state);
+        let is_own = |latest: &Arc<Latest>| state.is_home && latest.key.index > state.num_states_before;
+        let Some(latest) = room.slot.borrow().clone().filter(is_own) else { return Vec::new() };
+        let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
+        let key = head(latest.key.index).message(&latest.key.bytes);
+        latest.delta.iter().fold(vec![key], |mut messages, delta| {
+            messages.push(head(latest.index).message(delta));
+            messages
+        })
+    }
+
+    /// This node is a room's home from now on, under `epoch`; others may have had `sessions` sessions of it.
+    pub fn lead(&self, name: &RoomName, epoch: u64, sessions: u32) {
+        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
+        let mut state = lock(&room.state);
+        if !std::mem::replace(&mut state.is_home, true) {
+            state.num_states_before = state.num_states;
+        }
+        state.epoch = epoch;
+        state.num_sessions = state.num_sessions.max(sessions);
+    }
+
+    /// This node is a room's home no longer, unless somebody publishes to it.
+    pub fn give_up(&self, name: &RoomName) -> bool {
+        let Some(room) = self.find(name) else { return true };
+        let mut state = lock(&room.state);
+        if state.publishers.is_empty() {
+            state.is_home = false;
+        }
+        !state.is_home
+    }
+
+    /// Sends a room's publishers away: another node is its home, under `epoch` where that is known.
+    pub fn evict(&self, name: &RoomName, epoch: Option<u64>) {
+        let Some(room) = self.find(name) else { return };
+        let mut state = lock(&room.state);
+        state.is_home = false;
+        if let Some(epoch) = epoch {
+            // Where both were cut off from each other, this one's may be the greater.
+            state.epoch = epoch;
+            if state.fed.as_ref().is_some_and(|fed| fed.head.epoch > epoch) {
+                state.fed = None;
+            }
+        }
+        for publisher in std::mem::take(&mut state.publishers) {
+            state.mixer.leave(publisher.session);
+            self.metrics.publishers.dec();
+            // Its task may have ended in this moment.
+            let _ = publisher.evict.send(());
+        }
+        state.empty_since = Instant::now();
+    }
+
+    /// Rooms that somebody watches here.
+    pub fn watched(&self) -> Vec<Arc<Room>> {
+        lock(&self.by_name).values().filter(|room| lock(&room.state).num_viewers > 0).cloned().collect()
     }
 
     /// Removes rooms that have been without publisher and viewers for `idle`.
@@ -453,6 +614,51 @@ impl Room {
         Some(sink.status())
     }
 
+    /// Takes a packet that came from the room's home at another node.
+    pub fn feed(&self, head: StateHead, packet: Bytes) -> Fed {
+        let mut guard = lock(&self.state);
+        let state = &mut *guard;
+        if state.is_home || head.epoch < state.epoch || state.fed.as_ref().is_some_and(|fed| head <= fed.head) {
+            return Fed::Old;
+        }
+        let is_key = head.index == head.key_index;
+        let key = (head.epoch, head.key_index);
+        let fed = match &mut state.fed {
+            Some(fed) if is_key || fed.key == key => fed,
+            empty @ None if is_key => empty.insert(Box::new(FedState {
+                head: StateHead { epoch: 0, index: 0, key_index: 0 },
+                key: (0, 0),
+                decoder: Decoder::new(self.layout.clone()),
+                frame: self.layout.frame_at_rest(),
+            })),
+            _ => return Fed::NeedsKey,
+        };
+        // Here, once for all viewers: what cannot be read goes no further.
+        let is_sound = match fed.decoder.decode(&packet, &mut fed.frame) {
+            Ok(kind) => (kind == PacketKind::Key) == is_key,
+            Err(_) => false,
+        };
+        let (delta, key_packet) = match (&state.key, is_key) {
+            _ if !is_sound => {
+                // Its decoder may hold another key packet than is noted.
+                state.fed = None;
+                self.metrics.drop_frames("bad_cluster_packet", 1);
+                return Fed::Broken;
+            }
+            (_, true) => (None, Arc::new(KeyPacket { index: state.num_states + 1, bytes: packet })),
+            (Some(key), false) => (Some(packet), key.clone()),
+            (None, false) => return Fed::NeedsKey,
+        };
+        (fed.head, fed.key) = (head, key);
+        state.shown = Some((fed.frame.seq, fed.frame.captured_at_micros, fed.frame.face));
+        state.num_sessions = state.num_sessions.max(fed.frame.session);
+        state.epoch = head.epoch;
+        state.key = Some(key_packet.clone());
+        state.num_states += 1;
+        self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key: key_packet, delta, json: OnceLock::new() })));
+        Fed::Taken
+    }
+
     /// Where commands to the source in this slot go.
     pub fn controls(&self, slot: &str) -> Option<mpsc::Sender<Control>> {
         let state = lock(&self.state);
@@ -482,15 +688,15 @@ impl Room {
                         slot: claim.slot.name.clone(),
                         source: claim.source.clone(),
                         priority: claim.slot.priority,
-                        groups: claim.slot.groups.iter().map(ChannelGroup::name).collect(),
+                        groups: names_of(claim.slot.groups),
                         live,
-                        drives: drives.iter().map(ChannelGroup::name).collect(),
+                        drives: names_of(drives),
                         seconds: since.elapsed().as_secs_f64(),
                     }
                 })
                 .collect(),
             frame: state.shown.map(|(seq, micros, face)| FrameListing { seq, t: micros as f64 / 1e6, face }),
-            neutral: newest_neutral.map(|Neutral { session, calibration, .. }| NeutralListing {
+            neutral: newest_neutral.map(|Neutral { session, kept: Kept { calibration, .. } }| NeutralListing {
                 session: *session,
                 t: calibration.t,
                 num_frames: calibration.num_frames,
@@ -519,6 +725,9 @@ impl Drop for Viewing {
         state.num_viewers -= 1;
         state.empty_since = Instant::now();
         self.room.metrics.viewers.dec();
+        if let Some(interest) = &self.room.interest {
+            interest.send_replace(());
+        }
     }
 }
 
@@ -564,6 +773,12 @@ impl Publishing {
         };
         state.key = Some(key.clone());
         state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
+        if let Some(outlet) = &self.room.outlet {
+            let head = StateHead { epoch: state.epoch, index, key_index: key.index };
+            if !outlet.send(&self.room.name, head, &state.packet) {
+                self.room.metrics.drop_frames("slow_cluster", 1);
+            }
+        }
         // Under the lock, so that states stand in the slot in their order.
         self.room.slot.send_replace(Some(Arc::new(Latest { index, key, delta, json: OnceLock::new() })));
         true
@@ -577,24 +792,28 @@ impl Publishing {
         }
     }
 
-    /// Makes `calibration` the neutral face that the room keeps for the slot of `hello`, unless a later session has left one or it
-    /// is kept already.
-    pub fn keep_neutral(&self, hello: &PublishHello, calibration: &Calibration) {
+    /// Makes `kept` what the room keeps for `slot`, unless a later session has left something or it is kept already; true where it
+    /// is new.
+    pub fn keep(&self, slot: &str, kept: Kept) -> bool {
         let mut guard = lock(&self.room.state);
         let state = &mut *guard;
         let neutrals = &mut state.neutrals;
-        let slot = &hello.slot.name;
-        let kept = neutrals.get(slot);
-        if kept.is_none() && neutrals.len() >= MAX_SLOTS {
+        let before = neutrals.get(slot);
+        let is_new = before.is_none_or(|before| before.kept.calibration != kept.calibration);
+        if before.is_none() && neutrals.len() >= MAX_SLOTS {
             // Slots come and go under any names: the oldest neutral makes room.
             let oldest = neutrals.iter().min_by_key(|(_, neutral)| neutral.session).map(|(slot, _)| slot.clone());
             oldest.map(|oldest| neutrals.remove(&oldest));
-        } else if kept.is_some_and(|kept| kept.session > self.session || kept.calibration == *calibration) {
-            return;
+        } else if before.is_some_and(|before| before.session > self.session || before.kept == kept) {
+            return false;
         }
-        neutrals.insert(slot.clone(), Neutral { session: self.session, hello: hello.clone(), calibration: calibration.clone() });
-        self.room
-            .record(state, || Item::Event(SessionEvent::Neutral { session: self.session, calibration: Box::new(calibration.clone()) }));
+        let calibration = kept.calibration.clone();
+        neutrals.insert(slot.to_owned(), Neutral { session: self.session, kept });
+        if is_new {
+            self.room.record(state, || Item::Event(SessionEvent::Neutral { session: self.session, calibration: Box::new(calibration) }));
+        }
+        // Where another node is the home by now, it knows better.
+        state.is_home
     }
 }
 
@@ -611,6 +830,38 @@ impl Drop for Publishing {
     }
 }
 
+/// A room of the cluster as `/api/rooms` lists it.
+#[derive(Debug, Serialize)]
+pub(crate) struct ClusterListing {
+    #[serde(flatten)]
+    room: RoomListing,
+    /// Its home, or one where somebody watches.
+    node: String,
+    /// Viewers by node, where there are any.
+    nodes: BTreeMap<String, usize>,
+}
+
+/// All nodes' listings in one, by name: the room as its home tells of it, viewers summed up.
+pub(crate) fn merge(node: &str, own: Vec<RoomListing>, elsewhere: Vec<(String, RoomListing)>) -> Vec<ClusterListing> {
+    let mut by_name: BTreeMap<String, ClusterListing> = BTreeMap::new();
+    for (node, room) in own.into_iter().map(|room| (node.to_owned(), room)).chain(elsewhere) {
+        let viewers = room.viewers;
+        let listed = by_name.entry(room.name.clone()).or_insert_with(|| ClusterListing {
+            room: room.clone(),
+            node: node.clone(),
+            nodes: BTreeMap::new(),
+        });
+        if listed.room.publisher.is_none() && room.publisher.is_some() {
+            (listed.room, listed.node) = (room, node.clone());
+        }
+        if viewers > 0 {
+            listed.nodes.insert(node, viewers);
+        }
+        listed.room.viewers = listed.nodes.values().sum();
+    }
+    by_name.into_values().collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -619,7 +870,7 @@ mod tests {
         let character = Arc::new(Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap());
         let metrics = Arc::new(Metrics::new());
         let recorder = Recorder::new(crate::recording::RecordConfig::default(), &character, metrics.clone(), mpsc::channel(1).0);
-        Rooms::new(character, max_rooms, max_viewers, metrics, Arc::new(recorder))
+        Rooms::new(character, max_rooms, max_viewers, metrics, Arc::new(recorder), None)
     }
 
     /// Claims a slot that nobody commands, and of which nothing is recorded.

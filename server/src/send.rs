@@ -15,7 +15,7 @@ use std::future::Future;
 use std::io::{BufRead, Cursor};
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::net::TcpStream;
 use tokio::sync::{oneshot, watch};
@@ -24,13 +24,23 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::http::{HeaderValue, Uri, header};
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
-use tokio_tungstenite::tungstenite::{self, Message};
+use tokio_tungstenite::tungstenite::{self, Bytes, Message};
 use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
 
 /// How long the server may take to read what is on its way and to close.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(120);
 /// How long it may take to close when the sender is stopped.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
+/// How long a server may be silent where there are others: with it the face is elsewhere within two seconds.
+const SILENCE: Duration = Duration::from_millis(1200);
+/// How often such a server is pinged.
+const PING_EVERY: Duration = Duration::from_millis(300);
+/// How long such a server may take to let the publisher in: it may have to ask one that does not answer.
+const ENTER_TIMEOUT: Duration = Duration::from_millis(3500);
+/// Between tries when no server was there.
+const PAUSE: Duration = Duration::from_millis(200);
+/// Frames that are due for longer than this when another server is found are old, and left out.
+const OLD: Duration = Duration::from_millis(100);
 
 /// Largest answer of a server: a fit's profile takes a few KB.
 pub(crate) const MAX_ANSWER: usize = 1 << 20;
@@ -79,7 +89,8 @@ pub enum SendSource {
 pub struct SendOptions {
     /// The feed.
     pub source: SendSource,
-    /// The server, e.g. `ws://127.0.0.1:7878`.
+    /// The server, e.g. `ws://127.0.0.1:7878`, or nodes of a cluster with commas between them: when one is lost, the next one is
+    /// asked, and the face goes on there as it was.
     pub to: String,
     /// The room.
     pub room: String,
@@ -242,6 +253,32 @@ pub(crate) type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 type Sink = SplitSink<Socket, Message>;
 type Answers = SplitStream<Socket>;
 
+/// What outlives a connection.
+struct Journey {
+    /// The feed's own.
+    hello: String,
+    /// Which of the servers is asked.
+    at: usize,
+    /// The session that was begun last.
+    session: Option<u32>,
+    /// When the feed began, and its time then.
+    clock: Option<(Instant, f64)>,
+}
+
+/// Why a connection has ended before the feed.
+struct Lost {
+    error: SendError,
+    /// Another server may do better.
+    may_pass: bool,
+}
+
+impl From<FeedError> for Lost {
+    fn from(error: FeedError) -> Self {
+        Self { error: error.into(), may_pass: false }
+    }
+}
+
+/// Sends a feed, to one server after the other where one is lost.
 async fn send_once<R: BufRead>(
     mut feed: Feed<R>,
     options: &SendOptions,
@@ -249,52 +286,186 @@ async fn send_once<R: BufRead>(
     report: &mut SendReport,
     mut stop: Pin<&mut impl Future<Output = ()>>,
 ) -> Result<Ending, SendError> {
-    let url = format!("{}/v1/rooms/{}/publish", options.to.trim_end_matches('/'), options.room);
-    let connected = tokio::select! {
-        () = stop.as_mut() => return Ok(Ending::Stopped),
-        connected = connect(url, &options.trust, options.token.as_deref(), options.timeout, MAX_ANSWER) => connected?,
-    };
-    let (mut sink, answers) = connected.split();
-    let (ready, is_ready) = oneshot::channel();
-    // Answers are read beside the sending: a server whose answers nobody reads stops reading, too.
-    let mut listening = tokio::spawn(listen(answers, progress.clone(), ready));
-    let ended = |end: Result<End, tokio::task::JoinError>| SendError::Ended {
-        reason: end.map_or_else(|error| error.to_string(), |end| end.reason),
-    };
-
-    let ending = tokio::select! {
-        // An end of the listening says more than that a message did not get through.
-        biased;
-        end = &mut listening => return Err(ended(end)),
-        () = stop.as_mut() => Ending::Stopped,
-        sent = publish(&mut feed, &mut sink, is_ready, options, progress, report) => match sent {
-            Ok(()) => Ending::Sent,
-            Err(Unsent::Feed(error)) => return Err(error.into()),
-            Err(Unsent::Lost) => return Err(match tokio::time::timeout(options.timeout, listening).await {
-                Ok(end) => ended(end),
-                Err(_) => SendError::Ended { reason: "the connection broke off".into() },
-            }),
-            Err(Unsent::Stuck(reason)) => return Err(SendError::Ended { reason }),
-        },
-    };
-    // A server that has ended the session in this moment says so in its own close; one that reads nothing is cut off below.
-    let closing = async {
-        let _ = sink.send(Message::Close(None)).await;
-        (&mut listening).await
-    };
-    let patience = if ending == Ending::Stopped { STOP_TIMEOUT } else { CLOSE_TIMEOUT };
-    let end = tokio::select! {
-        end = tokio::time::timeout(patience, closing) => end,
-        () = stop, if ending == Ending::Sent => return Ok(Ending::Stopped),
-    };
-    match end {
-        Ok(Ok(End { is_normal: true, errors, .. })) => {
-            report.errors += errors;
-            Ok(ending)
+    let servers: Vec<&str> = options.to.split(',').map(|server| server.trim().trim_end_matches('/')).collect();
+    let mut journey = Journey { hello: feed.text().to_owned(), at: 0, session: None, clock: None };
+    let mut since = Instant::now();
+    let mut num_in_vain = 0;
+    loop {
+        let session = journey.session;
+        let over = Over { server: servers[journey.at], is_of_many: servers.len() > 1, options, progress };
+        let lost = match over.send(&mut feed, &mut journey, report, stop.as_mut()).await {
+            Ok(ending) => return Ok(ending),
+            Err(lost) => lost,
+        };
+        if journey.session != session {
+            (since, num_in_vain) = (Instant::now(), 0);
         }
-        Err(_) if ending == Ending::Stopped => Ok(ending),
-        Ok(end) => Err(ended(end)),
-        Err(_) => Err(SendError::Ended { reason: "it does not answer the close".into() }),
+        if !lost.may_pass || servers.len() < 2 || since.elapsed() >= options.timeout {
+            return Err(lost.error);
+        }
+        journey.at = (journey.at + 1) % servers.len();
+        tracing::warn!(error = %lost.error, next = servers[journey.at], "server lost");
+        num_in_vain += 1;
+        if num_in_vain >= servers.len() {
+            tokio::select! {
+                () = stop.as_mut() => return Ok(Ending::Stopped),
+                () = tokio::time::sleep(PAUSE) => {}
+            }
+        }
+    }
+}
+
+/// One connection.
+struct Over<'a> {
+    server: &'a str,
+    is_of_many: bool,
+    options: &'a SendOptions,
+    progress: &'a ProgressBar,
+}
+
+impl Over<'_> {
+    /// Sends what is left of a feed.
+    async fn send<R: BufRead>(
+        &self,
+        feed: &mut Feed<R>,
+        journey: &mut Journey,
+        report: &mut SendReport,
+        mut stop: Pin<&mut impl Future<Output = ()>>,
+    ) -> Result<Ending, Lost> {
+        let options = self.options;
+        let url = format!("{}/v1/rooms/{}/publish", self.server, options.room);
+        let patience = if self.is_of_many { options.timeout.min(SILENCE) } else { options.timeout };
+        let connected = tokio::select! {
+            () = stop.as_mut() => return Ok(Ending::Stopped),
+            connected = connect(url, &options.trust, options.token.as_deref(), patience, MAX_ANSWER) => {
+                connected.map_err(|error| Lost { error, may_pass: true })?
+            }
+        };
+        let (mut sink, answers) = connected.split();
+        let (ready, is_ready) = oneshot::channel();
+        let heard = Arc::new(Mutex::new(Instant::now()));
+        // Answers are read beside the sending: a server whose answers nobody reads stops reading, too.
+        let mut listening = tokio::spawn(listen(answers, self.progress.clone(), ready, heard.clone()));
+        let ended = |end: Result<End, tokio::task::JoinError>| match end {
+            Ok(End { reason, may_pass, .. }) => Lost { error: SendError::Ended { reason }, may_pass },
+            Err(error) => Lost { error: SendError::Ended { reason: error.to_string() }, may_pass: false },
+        };
+        // At full speed a server may have much to read before it comes to a ping.
+        let is_watched = self.is_of_many && options.speed.is_finite();
+        let begun = journey.session;
+
+        let ending = tokio::select! {
+            // An end of the listening says more than that a message did not get through.
+            biased;
+            end = &mut listening => return Err(ended(end)),
+            () = stop.as_mut() => Ending::Stopped,
+            () = silence(&heard), if is_watched => {
+                let reason = format!("nothing heard for {} s", SILENCE.as_secs_f64());
+                listening.abort();
+                return Err(Lost { error: SendError::Ended { reason }, may_pass: true });
+            }
+            sent = self.publish(feed, &mut sink, is_ready, &heard, journey, report) => match sent {
+                Ok(()) => Ending::Sent,
+                Err(Unsent::Feed(error)) => return Err(error.into()),
+                Err(Unsent::Lost) => return Err(match tokio::time::timeout(patience, listening).await {
+                    Ok(end) => ended(end),
+                    Err(_) => Lost { error: SendError::Ended { reason: "the connection broke off".into() }, may_pass: true },
+                }),
+                Err(Unsent::Stuck(reason)) => return Err(Lost { error: SendError::Ended { reason }, may_pass: true }),
+            },
+        };
+        // A server that has ended the session in this moment says so in its own close; one that reads nothing is cut off below.
+        let closing = async {
+            let _ = sink.send(Message::Close(None)).await;
+            (&mut listening).await
+        };
+        let patience = if ending == Ending::Stopped { STOP_TIMEOUT } else { CLOSE_TIMEOUT };
+        let end = tokio::select! {
+            end = tokio::time::timeout(patience, closing) => end,
+            () = stop, if ending == Ending::Sent => return Ok(Ending::Stopped),
+        };
+        match end {
+            Ok(Ok(End { is_normal: true, errors, .. })) => {
+                report.errors += errors;
+                Ok(ending)
+            }
+            Err(_) if ending == Ending::Stopped => Ok(ending),
+            // All of it has been sent, so nothing is left for another server.
+            Ok(end) => Err(Lost { may_pass: journey.session == begun, ..ended(end) }),
+            Err(_) => Err(Lost { error: SendError::Ended { reason: "it does not answer the close".into() }, may_pass: false }),
+        }
+    }
+
+    /// Sends the hello and, once the server is ready, what is left of the feed in its time.
+    async fn publish<R: BufRead>(
+        &self,
+        feed: &mut Feed<R>,
+        sink: &mut Sink,
+        is_ready: oneshot::Receiver<u32>,
+        heard: &Mutex<Instant>,
+        journey: &mut Journey,
+        report: &mut SendReport,
+    ) -> Result<(), Unsent> {
+        let options = self.options;
+        let within = |what: &str, time: Duration| Unsent::Stuck(format!("{what} within {} s", time.as_secs_f64()));
+        let mut write = async |message: Message| match tokio::time::timeout(options.timeout, sink.send(message)).await {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(_)) => Err(Unsent::Lost),
+            Err(_) => Err(within("it read nothing", options.timeout)),
+        };
+        write(Message::text(hello(&journey.hello, options, journey.session))).await?;
+        let patience = if self.is_of_many { options.timeout.min(ENTER_TIMEOUT) } else { options.timeout };
+        // The server reads nothing while it finds out whether the publisher may come in.
+        set(heard, Instant::now() + patience);
+        // An error means that the listening has ended, which is told there.
+        let session = tokio::time::timeout(patience, is_ready).await.map_err(|_| within("no answer to the hello", patience))?;
+        let is_again = journey.session.is_some();
+        journey.session = Some(session.map_err(|_| Unsent::Lost)?);
+        set(heard, Instant::now());
+        let mut pinged = Instant::now();
+        let mut frame = TrackingFrame::default();
+        let came = Instant::now();
+        while let Some(item) = feed.next_frame(&mut frame).map_err(Unsent::Feed)? {
+            if item == FeedItem::Frame {
+                let (start, t0) = *journey.clock.get_or_insert_with(|| (Instant::now(), frame.t));
+                // At infinite speed every frame is due at once.
+                let due = start + Duration::from_secs_f64(((frame.t - t0) / options.speed).clamp(0.0, 1e9));
+                if is_again && options.speed.is_finite() && due + OLD < came {
+                    self.progress.inc(feed.text().len() as u64 + 1);
+                    continue;
+                }
+                loop {
+                    if self.is_of_many && pinged.elapsed() >= PING_EVERY {
+                        pinged = Instant::now();
+                        write(Message::Ping(Bytes::new())).await?;
+                    }
+                    if due <= Instant::now() {
+                        break;
+                    }
+                    tokio::time::sleep_until(if self.is_of_many { due.min(pinged + PING_EVERY) } else { due }).await;
+                }
+                report.frames += 1;
+            }
+            let binary = if options.binary && item == FeedItem::Frame { binary_form(&frame, feed.text()) } else { None };
+            write(binary.unwrap_or_else(|| Message::text(feed.text()))).await?;
+            self.progress.inc(feed.text().len() as u64 + 1);
+        }
+        Ok(())
+    }
+}
+
+fn set(heard: &Mutex<Instant>, at: Instant) {
+    *heard.lock().unwrap_or_else(PoisonError::into_inner) = at;
+}
+
+/// Done when nothing has been heard for too long.
+async fn silence(heard: &Mutex<Instant>) {
+    loop {
+        let end = *heard.lock().unwrap_or_else(PoisonError::into_inner) + SILENCE;
+        if end <= Instant::now() {
+            return;
+        }
+        tokio::time::sleep_until(end).await;
     }
 }
 
@@ -349,45 +520,6 @@ enum Unsent {
     Stuck(String),
 }
 
-/// Sends the hello and, once the server is ready, the feed in its time.
-async fn publish<R: BufRead>(
-    feed: &mut Feed<R>,
-    sink: &mut Sink,
-    is_ready: oneshot::Receiver<()>,
-    options: &SendOptions,
-    progress: &ProgressBar,
-    report: &mut SendReport,
-) -> Result<(), Unsent> {
-    let within = |what: &str| Unsent::Stuck(format!("{what} within {} s", options.timeout.as_secs_f64()));
-    let mut write = async |message: Message| match tokio::time::timeout(options.timeout, sink.send(message)).await {
-        Ok(Ok(())) => Ok(()),
-        Ok(Err(_)) => Err(Unsent::Lost),
-        Err(_) => Err(within("it read nothing")),
-    };
-    write(Message::text(hello(feed.text(), options))).await?;
-    // An error means that the listening has ended, which is told there.
-    if tokio::time::timeout(options.timeout, is_ready).await.map_err(|_| within("no answer to the hello"))?.is_err() {
-        return Err(Unsent::Lost);
-    }
-    let mut frame = TrackingFrame::default();
-    let mut clock: Option<(Instant, f64)> = None;
-    while let Some(item) = feed.next_frame(&mut frame).map_err(Unsent::Feed)? {
-        if item == FeedItem::Frame {
-            let (start, t0) = *clock.get_or_insert_with(|| (Instant::now(), frame.t));
-            // At infinite speed every frame is due at once.
-            let due = start + Duration::from_secs_f64(((frame.t - t0) / options.speed).clamp(0.0, 1e9));
-            if due > Instant::now() {
-                tokio::time::sleep_until(due).await;
-            }
-            report.frames += 1;
-        }
-        let binary = if options.binary && item == FeedItem::Frame { binary_form(&frame, feed.text()) } else { None };
-        write(binary.unwrap_or_else(|| Message::text(feed.text()))).await?;
-        progress.inc(feed.text().len() as u64 + 1);
-    }
-    Ok(())
-}
-
 /// A frame of landmarks in the binary form; `None` for what stays JSON: other frames, and those that also give expressions,
 /// which a sender's reader leaves out.
 fn binary_form(frame: &TrackingFrame, text: &str) -> Option<Message> {
@@ -405,25 +537,31 @@ struct End {
     is_normal: bool,
     reason: String,
     errors: u64,
+    /// Another server may do better.
+    may_pass: bool,
 }
 
 /// Shows the server's answers until it closes.
-async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sender<()>) -> End {
+async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sender<u32>, heard: Arc<Mutex<Instant>>) -> End {
     let mut ready = Some(ready);
     let mut errors = 0;
     let mut last_error = None;
+    let mut may_pass = false;
     while let Some(message) = answers.next().await {
+        set(&heard, Instant::now());
         match message {
             Ok(Message::Text(text)) => match serde_json::from_str(&text) {
                 Ok(Answer::Ready { session }) => {
                     tracing::info!(session, "ready");
                     // The sender may have given up in this moment.
-                    let _ = ready.take().map(|ready| ready.send(()));
+                    let _ = ready.take().map(|ready| ready.send(session));
                 }
                 Ok(Answer::Calibrated { t }) => tracing::info!(t, "calibrated"),
                 Ok(Answer::Error { code, message }) if code == "too_fast" => tracing::info!(message),
                 Ok(Answer::Error { code, message }) => {
                     errors += 1;
+                    // Other nodes of the cluster may know better, or be the room's home.
+                    may_pass = matches!(code.as_str(), "room_elsewhere" | "cluster" | "shutting_down" | "too_many_connections" | "idle");
                     progress.suspend(|| eprintln!("server: {message} ({code})"));
                     last_error = Some(message);
                 }
@@ -431,24 +569,32 @@ async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sen
             },
             Ok(Message::Close(frame)) => {
                 let is_normal = frame.as_ref().is_none_or(|frame| matches!(frame.code, CloseCode::Normal | CloseCode::Status));
+                let is_going = frame.as_ref().is_some_and(|frame| matches!(frame.code, CloseCode::Away | CloseCode::Restart));
                 let said = frame.map(|frame| frame.reason.to_string()).filter(|reason| !reason.is_empty());
                 let reason = last_error.or(said).unwrap_or_else(|| "without a reason".into());
-                return End { is_normal, reason, errors };
+                return End { is_normal, reason, errors, may_pass: may_pass || is_going };
             }
             Ok(_) => {}
-            Err(error) => return End { is_normal: false, reason: last_error.unwrap_or_else(|| error.to_string()), errors },
+            Err(error) => {
+                let may_pass = may_pass || last_error.is_none();
+                return End { is_normal: false, reason: last_error.unwrap_or_else(|| error.to_string()), errors, may_pass };
+            }
         }
     }
-    End { is_normal: false, reason: last_error.unwrap_or_else(|| "the connection broke off".into()), errors }
+    let may_pass = may_pass || last_error.is_none();
+    End { is_normal: false, reason: last_error.unwrap_or_else(|| "the connection broke off".into()), errors, may_pass }
 }
 
-/// The feed's hello, with what the options add to it.
-fn hello(line: &str, options: &SendOptions) -> String {
-    if !options.takeover && options.profile.is_none() && options.slot.is_none() && options.priority.is_none() {
+/// The feed's hello, with what the options add to it, or as that of one who comes back from `session`.
+fn hello(line: &str, options: &SendOptions, session: Option<u32>) -> String {
+    if !options.takeover && options.profile.is_none() && options.slot.is_none() && options.priority.is_none() && session.is_none() {
         return line.to_owned();
     }
     let Ok(mut fields) = serde_json::from_str::<serde_json::Map<String, serde_json::Value>>(line) else { return line.to_owned() };
-    if options.takeover {
+    if let Some(session) = session {
+        fields.insert("resume".into(), session.into());
+        fields.insert("keep_neutral".into(), true.into());
+    } else if options.takeover {
         fields.insert("takeover".into(), true.into());
     }
     if let Some(slot) = &options.slot {

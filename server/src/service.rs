@@ -1,5 +1,6 @@
 //! The service as a whole: connections in, tasks out, and an orderly end.
 
+use crate::cluster::{Cluster, ClusterError};
 use crate::config::{Limits, ServerConfig, ServerConfigError, seconds};
 use crate::http::router;
 use crate::metrics::Metrics;
@@ -71,6 +72,9 @@ pub enum ServerError {
     /// The recording could not be played.
     #[error(transparent)]
     Play(PlayError),
+    /// The cluster cannot be joined.
+    #[error(transparent)]
+    Cluster(#[from] ClusterError),
     /// The folder of profiles cannot be used.
     #[error(transparent)]
     Profiles(#[from] ProfileError),
@@ -111,9 +115,11 @@ pub(crate) struct Hub {
     pub character_url: String,
     pub hello_character: CharacterHello,
     pub layout: PacketLayout,
-    pub rooms: Rooms,
+    pub rooms: Arc<Rooms>,
     pub recorder: Arc<Recorder>,
     pub players: Players,
+    /// This node among others.
+    pub cluster: Option<Arc<Cluster>>,
     pub trackers: Trackers,
     pub profiles: Arc<Profiles>,
     pub metrics: Arc<Metrics>,
@@ -191,16 +197,28 @@ pub async fn run(
     }
     let profiles = Profiles::load(config.profiles.as_deref())?;
     let metrics = Arc::new(Metrics::new());
+    let cluster = match &config.cluster.nats {
+        Some(url) => {
+            let scheme = if identity.is_some() { "wss" } else { "ws" };
+            let advertised = config.cluster.advertise.clone().unwrap_or_else(|| format!("{scheme}://{address}"));
+            Some(Cluster::join(&config.cluster, url, advertised, &character.sha256).await?)
+        }
+        None => None,
+    };
+    let others = cluster.as_ref().map(|cluster| cluster.others());
+    let limits = &config.limits;
     let (stop, stops) = watch::channel(false);
     let (tasks, mut tasks_end) = mpsc::channel(1);
+    let recorder = Arc::new(Recorder::new(config.record.clone(), &character, metrics.clone(), tasks.clone()));
+    let rooms = Arc::new(Rooms::new(character.clone(), limits.rooms, limits.viewers_per_room, metrics.clone(), recorder.clone(), others));
     let character_url = format!("/characters/{}.glb", file_name(&character.name));
     let hello_character = ViewHello::new("", &character, character_url.clone()).character;
     let layout = PacketLayout::from(&*character);
-    let recorder = Arc::new(Recorder::new(config.record.clone(), &character, metrics.clone(), tasks.clone()));
     let hub = Arc::new(Hub {
         players: Players::default(),
-        rooms: Rooms::new(character.clone(), config.limits.rooms, config.limits.viewers_per_room, metrics.clone(), recorder.clone()),
+        rooms: rooms.clone(),
         recorder,
+        cluster: cluster.clone(),
         hello_character,
         layout,
         trackers: Trackers::default(),
@@ -225,6 +243,10 @@ pub async fn run(
         move || hub.upgrade().iter().for_each(|hub| crate::solve::prepare(&hub.character, &hub.config.solve))
     });
     tracing::info!(%address, character = hub.character.name, "serving");
+    if let Some(cluster) = &cluster {
+        cluster.start(Arc::downgrade(&rooms), &hub.shutdown);
+        cluster.wait().await;
+    }
     if let Some(Play { file, room, request }) = hub.config.play.clone() {
         hub.players.start(&hub, &room, &file, request, &|_| true).map_err(ServerError::Play)?;
     }
@@ -256,6 +278,10 @@ pub async fn run(
     }
     tracing::info!("shutting down");
     drop(listener);
+    if let Some(cluster) = &cluster {
+        cluster.leave(&rooms).await;
+    }
+    drop(rooms);
     // Receivers live in the hub, so this cannot fail.
     let _ = stop.send(true);
     hub.rooms.wake_viewers();

@@ -2,6 +2,7 @@
 //! or somebody for it, asks for.
 
 use crate::answer::Answer;
+use crate::cluster::{Cluster, Kept};
 use crate::pipeline::Pipeline;
 use crate::profiles::Profiles;
 use crate::publish::Rate;
@@ -10,7 +11,9 @@ use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
 use crate::socket::ErrorMessage;
 use crate::solve::{Calibration, SolveError};
-use rhytid_shared::{Command, FitRequest, Profile, ProfileChoice, PublishHello, PublishReader, RoomName, Settings, TrackingFrame};
+use rhytid_shared::{
+    Command, FaceKind, FitRequest, PROFILE_VERSION, Profile, ProfileChoice, PublishHello, PublishReader, RoomName, Settings, TrackingFrame,
+};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
@@ -96,6 +99,7 @@ pub(crate) struct Source {
     hello: PublishHello,
     controls: mpsc::Receiver<Control>,
     profiles: Arc<Profiles>,
+    cluster: Option<Arc<Cluster>>,
     /// The profile in use.
     profile: Option<Profile>,
     /// Its settings have changed since it was kept.
@@ -116,17 +120,28 @@ impl Source {
     /// Claims the slot that `hello` names; `sent` is the hello's text where the publisher sent one. The second value is done when another
     /// publisher has taken it over.
     pub fn open(hub: &Hub, room: &RoomName, mut hello: PublishHello, sent: Option<Utf8Bytes>) -> Result<(Self, Evicted), OpenError> {
+        let kept = hello.keep_neutral.then(|| hub.rooms.kept(room, &hello)).flatten();
+        let resumed = kept.as_ref().filter(|_| hello.resume.is_some()).and_then(|kept| kept.profile.clone());
+        if let Some(profile) = resumed {
+            // One who comes back in the middle finds everything as it was, also what has been changed since its first hello.
+            hello.settings = Settings::default();
+            hello.profile = Some(ProfileChoice::Given(Box::new(profile)));
+        }
+        let kept_profile = kept.as_ref().and_then(|kept| kept.profile.clone());
+        let kept = kept.map(|kept| kept.calibration);
         let profile = match hello.profile.take() {
             Some(ProfileChoice::Given(profile)) => Some(*profile),
             Some(ProfileChoice::Named(name)) => match hub.profiles.named(&name) {
                 Some(profile) => Some((*profile).clone()),
                 None => return Err(UnknownProfile(name).into()),
             },
-            None => hub.profiles.of_source(&hello.source).map(|profile| (*profile).clone()),
+            None => match kept_profile {
+                Some(profile) => Some(profile),
+                None => hub.profiles.of_source(&hello.source).map(|profile| (*profile).clone()),
+            },
         };
         hello.profile = profile.clone().map(|profile| ProfileChoice::Given(Box::new(profile)));
         // Before the slot is claimed: a hello that leads to nothing takes no slot from anybody.
-        let kept = hello.keep_neutral.then(|| hub.rooms.neutral(room, &hello)).flatten();
         let (mut pipeline, kept_neutral) = start(hub, &hello, kept.clone())?;
         let (controls, waiting) = mpsc::channel(MOST_CONTROLS);
         let slot: Arc<str> = hello.slot.name.as_str().into();
@@ -161,6 +176,7 @@ impl Source {
             hello,
             controls: waiting,
             profiles: hub.profiles.clone(),
+            cluster: hub.cluster.clone(),
             profile,
             is_profile_changed: false,
             fit_owner: FitOwner::Publisher,
@@ -281,6 +297,7 @@ impl Source {
             self.is_profile_changed |= profile.settings != settings;
             profile.settings = settings;
         }
+        self.keep_neutral();
     }
 
     fn use_profile(&mut self, choice: ProfileChoice) -> Result<Utf8Bytes, ErrorMessage> {
@@ -314,6 +331,7 @@ impl Source {
             false
         });
         (self.profile, self.is_profile_changed) = (Some(profile), false);
+        self.keep_neutral();
         kept
     }
 
@@ -395,10 +413,25 @@ impl Source {
         let _ = answer.send(told);
     }
 
-    /// Leaves the neutral in use with the room.
-    fn keep_neutral(&self) {
-        if let Some(calibration) = self.pipeline.calibration() {
-            self.place.keep_neutral(&self.hello, calibration);
+    /// Leaves the neutral in use with the room, and with other nodes.
+    fn keep_neutral(&mut self) {
+        let Some(calibration) = self.pipeline.calibration().cloned() else { return };
+        let solver = self.pipeline.solver();
+        let (settings, ranges) = (*solver.settings(), *solver.ranges());
+        let measured = if calibration.points.is_empty() { FaceKind::Weights } else { FaceKind::Landmarks };
+        let profile = match &self.profile {
+            Some(profile) => Profile { neutral: None, ranges, settings, ..profile.clone() },
+            None => {
+                let (name, source) = (String::new(), self.hello.source.clone());
+                Profile { rhytid_profile: PROFILE_VERSION, name, source, measured, neutral: None, ranges, settings }
+            }
+        };
+        let kept = Kept { tracker: self.hello.tracker(), calibration, profile: Some(profile) };
+        let slot = &self.hello.slot.name;
+        if self.place.keep(slot, kept.clone())
+            && let Some(cluster) = &self.cluster
+        {
+            cluster.keep(self.room(), slot, &kept);
         }
     }
 

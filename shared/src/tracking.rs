@@ -38,21 +38,24 @@ pub struct PublishHello {
     pub focal: Option<f32>,
     /// Take the slot over from another publisher.
     pub takeover: bool,
+    /// Take the slot over from this session, which was the publisher's own until its connection broke, with everything as it was.
+    pub resume: Option<u32>,
     /// The source slot that it claims.
     pub slot: Slot,
     /// Settings to start with.
     pub settings: Settings,
-    /// Start from the neutral face that the room keeps of the same tracker, see [`Self::is_of_same_tracker`].
+    /// Start from the neutral face that the room keeps of the same tracker, see [`Self::tracker`].
     pub keep_neutral: bool,
     /// What is known of the performer.
     pub profile: Option<ProfileChoice>,
 }
 
 impl PublishHello {
-    /// True where the two come from one tracker before one camera as far as they say, so that the neutral face of one
-    /// session is that of the other.
-    pub fn is_of_same_tracker(&self, other: &Self) -> bool {
-        (&self.source, &self.layout, self.image, self.focal) == (&other.source, &other.layout, other.image, other.focal)
+    /// What tells one tracker before one camera from another, as far as the hello says: the neutral face of one session is that of
+    /// another with the same.
+    pub fn tracker(&self) -> String {
+        let Self { source, layout, image, focal, .. } = self;
+        format!("{source:?} {layout:?} {image:?} {focal:?}")
     }
 }
 

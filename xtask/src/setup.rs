@@ -18,7 +18,7 @@ struct Need {
     without: &'static str,
 }
 
-const NEEDS: [Need; 7] = [
+const NEEDS: [Need; 8] = [
     Need {
         what: "a Vulkan driver",
         packages: &["libvulkan1", "mesa-vulkan-drivers"],
@@ -42,6 +42,13 @@ const NEEDS: [Need; 7] = [
         packages: &["spirv-tools"],
         is_here: || is_on_path("spirv-opt"),
         without: "the test of the shaders' cost shows as ignored",
+    },
+    Need {
+        what: "NATS, through which nodes of a cluster meet",
+        packages: &["nats-server"],
+        // Debian puts it where only root's path leads.
+        is_here: || is_on_path("nats-server") || Path::new("/usr/sbin/nats-server").is_file(),
+        without: "the tests of clusters show as ignored; one server alone needs none",
     },
     Need {
         what: "Node.js and npm, which fetch the page's face tracker and run its tests",

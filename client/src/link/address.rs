@@ -17,6 +17,43 @@ pub struct ServerAddress {
     port: u16,
 }
 
+/// One server, or several nodes of a cluster with commas between them, in the order in which they are tried.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ServerAddresses(Vec<ServerAddress>);
+
+/// Most addresses that one viewer tries.
+const MAX_SERVERS: usize = 64;
+
+impl ServerAddresses {
+    /// One or more.
+    pub(super) fn all(&self) -> &[ServerAddress] {
+        &self.0
+    }
+
+    /// The one that is asked first.
+    pub fn first(&self) -> &ServerAddress {
+        &self.0[0]
+    }
+}
+
+impl fmt::Display for ServerAddresses {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (k, address) in self.0.iter().enumerate() {
+            write!(f, "{}{address}", if k > 0 { ", " } else { "" })?;
+        }
+        Ok(())
+    }
+}
+
+impl FromStr for ServerAddresses {
+    type Err = AddressError;
+
+    fn from_str(text: &str) -> Result<Self, AddressError> {
+        let all = text.split(',').take(MAX_SERVERS).map(|address| address.trim().parse());
+        Ok(Self(all.collect::<Result<_, _>>()?))
+    }
+}
+
 /// An address that is none.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum AddressError {
@@ -109,6 +146,13 @@ mod tests {
         assert_eq!(address.host_and_port(), ("::1", 80));
         assert_eq!(address.view_uri(&RoomName::new("demo").unwrap()), "ws://[::1]:80/v1/rooms/demo/view");
         assert_eq!(address.http_url("/characters/a.glb"), "http://[::1]:80/characters/a.glb");
+    }
+
+    #[test]
+    fn several_addresses_stand_with_commas_between_them() {
+        let addresses: ServerAddresses = "ws://a:1, wss://b".parse().unwrap();
+        assert_eq!((addresses.all().len(), addresses.to_string()), (2, "ws://a:1, wss://b:7878".to_owned()));
+        assert!("ws://a,".parse::<ServerAddresses>().is_err());
     }
 
     #[test]

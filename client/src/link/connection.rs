@@ -2,7 +2,7 @@
 
 use super::inbox::Inbox;
 use super::wire::Wire;
-use super::{CharacterSource, Connected, LinkOptions, fetch};
+use super::{CharacterSource, Connected, LinkOptions, ServerAddress, fetch};
 use rhytid_shared::FaceFrame;
 use rhytid_shared::packet::{Decoder, PacketLayout};
 use rhytid_shared::view::{PROTOCOL_VERSION, SUBPROTOCOL, ViewHello, ViewMessage};
@@ -17,12 +17,17 @@ use tungstenite::{ClientRequestBuilder, HandshakeError, Message, WebSocket};
 
 /// Longest time to reach the server, and again to shake hands.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
+/// The same where there are other servers to try.
+const CONNECT_TIMEOUT_OF_MANY: Duration = Duration::from_secs(1);
 /// How often a quiet socket is looked up from, to ping and to see whether the link shall end.
 const LOOK_UP: Duration = Duration::from_millis(50);
 /// How often the way is measured.
 const PING_EVERY: Duration = Duration::from_secs(2);
 /// After three pings without any answer the server is gone, whatever TCP thinks.
 const SILENCE: Duration = Duration::from_secs(6);
+/// The same two where there are other servers to try: the face shall be back within two seconds.
+const PING_EVERY_OF_MANY: Duration = Duration::from_millis(300);
+const SILENCE_OF_MANY: Duration = Duration::from_millis(1200);
 /// Largest message: the hello of 64 bones and 8 poses takes about 60 KB.
 const MAX_MESSAGE: usize = 1 << 20;
 /// What tungstenite reads at once; its own 128 KiB is for files.
@@ -41,14 +46,18 @@ pub(super) enum Ended {
 }
 
 /// Connects and reads until the connection is over. The sha256 of a character fetched on the way is kept in `options`.
-pub(super) fn watch(options: &mut LinkOptions, inbox: &Inbox, wake: &dyn Fn()) -> Ended {
-    let socket = match connect(options) {
+pub(super) fn watch(options: &mut LinkOptions, server: &ServerAddress, inbox: &Inbox, wake: &dyn Fn()) -> Ended {
+    let is_of_many = options.servers.all().len() > 1;
+    let socket = match connect(options, server, if is_of_many { CONNECT_TIMEOUT_OF_MANY } else { CONNECT_TIMEOUT }) {
         Ok(socket) => socket,
         Err(ended) => return ended,
     };
     let mut connection = Connection {
         socket,
         options,
+        server,
+        ping_every: if is_of_many { PING_EVERY_OF_MANY } else { PING_EVERY },
+        silence: if is_of_many { SILENCE_OF_MANY } else { SILENCE },
         inbox,
         wake,
         stream: None,
@@ -66,28 +75,28 @@ pub(super) fn watch(options: &mut LinkOptions, inbox: &Inbox, wake: &dyn Fn()) -
     ended
 }
 
-fn connect(options: &LinkOptions) -> Result<WebSocket<Wire>, Ended> {
+fn connect(options: &LinkOptions, server: &ServerAddress, timeout: Duration) -> Result<WebSocket<Wire>, Ended> {
     let lost = |why: String| Ended::Lost(why);
-    let (host, port) = options.server.host_and_port();
+    let (host, port) = server.host_and_port();
     let addresses = (host, port).to_socket_addrs().map_err(|error| lost(format!("{host} is not known: {error}")))?;
     let mut failure = format!("{host} has no address");
     let stream = addresses
         .into_iter()
-        .find_map(|address| TcpStream::connect_timeout(&address, CONNECT_TIMEOUT).map_err(|error| failure = plain_words(&error)).ok())
+        .find_map(|address| TcpStream::connect_timeout(&address, timeout).map_err(|error| failure = plain_words(&error)).ok())
         .ok_or_else(|| lost(failure))?;
     let set_up = || {
         stream.set_nodelay(true)?;
-        stream.set_read_timeout(Some(CONNECT_TIMEOUT))?;
-        stream.set_write_timeout(Some(CONNECT_TIMEOUT))
+        stream.set_read_timeout(Some(timeout))?;
+        stream.set_write_timeout(Some(timeout))
     };
     set_up().map_err(|error| lost(error.to_string()))?;
-    let stream = Wire::new(stream, &options.server, &options.trust).map_err(|error| untrusted(&error))?;
+    let stream = Wire::new(stream, server, &options.trust).map_err(|error| untrusted(&error))?;
 
-    let uri = options.server.view_uri(&options.room);
+    let uri = server.view_uri(&options.room);
     let uri = uri.parse().map_err(|error| Ended::Refused(format!("{uri} is no address: {error}")))?;
     let mut request = ClientRequestBuilder::new(uri).with_sub_protocol(SUBPROTOCOL);
     if let Some(token) = &options.token {
-        if !options.server.may_carry_secrets() {
+        if !server.may_carry_secrets() {
             return Err(Ended::Refused("a token goes over wss:// only, or to this machine: others on the way could read it".into()));
         }
         request = request.with_header("Authorization", format!("Bearer {token}"));
@@ -149,6 +158,9 @@ fn plain_words(error: &std::io::Error) -> String {
 struct Connection<'a> {
     socket: WebSocket<Wire>,
     options: &'a mut LinkOptions,
+    server: &'a ServerAddress,
+    ping_every: Duration,
+    silence: Duration,
     inbox: &'a Inbox,
     wake: &'a dyn Fn(),
     /// What packets are decoded with, once the hello has come.
@@ -216,10 +228,10 @@ impl Connection<'_> {
 
     fn keep_alive(&mut self) -> Result<(), Ended> {
         let now = Instant::now();
-        if now - self.heard_at > SILENCE {
-            return Err(Ended::Lost(format!("nothing heard for {} s", SILENCE.as_secs())));
+        if now - self.heard_at > self.silence {
+            return Err(Ended::Lost(format!("nothing heard for {} s", self.silence.as_secs_f32())));
         }
-        if now - self.pinged_at >= PING_EVERY {
+        if now - self.pinged_at >= self.ping_every {
             self.pings += 1;
             self.pinged_at = now;
             let ping = Message::Ping(self.pings.to_le_bytes().to_vec().into());
@@ -257,7 +269,7 @@ impl Connection<'_> {
         let character = if self.options.known_sha256.as_ref() == Some(wanted) {
             CharacterSource::Known
         } else {
-            let glb = fetch::character(&self.options.server, &self.options.trust, &hello.character.url, wanted)
+            let glb = fetch::character(self.server, &self.options.trust, &hello.character.url, wanted)
                 .map_err(|error| Ended::NoCharacter(error.to_string()))?;
             self.options.known_sha256 = Some(wanted.clone());
             CharacterSource::Fetched(glb)

@@ -30,7 +30,7 @@ impl TestServer {
     fn options(&self, known_sha256: &str) -> LinkOptions {
         let server = format!("ws://{}", self.listener.local_addr().unwrap()).parse().unwrap();
         LinkOptions {
-            server,
+            servers: server,
             room: RoomName::new("demo").unwrap(),
             trust: Trust::Public,
             token: None,
@@ -349,7 +349,7 @@ fn watch(server: &TestServer) -> (Spectator, Socket) {
     let character = two_bones();
     let spectator = Spectator::open(
         WatchArgs {
-            server: server.options("").server,
+            servers: server.options("").servers,
             room: RoomName::new("demo").unwrap(),
             trust: Trust::Public,
             token: TokenArgs::default(),
@@ -430,7 +430,7 @@ fn status_says_that_the_server_is_gone_and_when_it_is_back() {
 fn status_tells_attempts_in_vain_and_refusals() {
     let server = TestServer::start();
     let watched = WatchArgs {
-        server: server.options("").server,
+        servers: server.options("").servers,
         room: RoomName::new("demo").unwrap(),
         trust: Trust::Public,
         token: TokenArgs::default(),
@@ -488,4 +488,48 @@ fn way_is_measured_and_a_dropped_link_says_goodbye() {
     assert!(round_trip < Duration::from_secs(2));
     drop(link);
     assert!(reader.join().unwrap(), "the server must see a close frame");
+}
+
+/// Options for two nodes of a cluster.
+fn two_nodes(first: &TestServer, second: &TestServer) -> LinkOptions {
+    let address = |server: &TestServer| server.listener.local_addr().unwrap();
+    let servers = format!("ws://{},ws://{}", address(first), address(second)).parse().unwrap();
+    LinkOptions { servers, ..first.options("a") }
+}
+
+#[test]
+fn link_goes_on_at_the_next_node_at_once_when_one_breaks() {
+    let (first, second) = (TestServer::start(), TestServer::start());
+    let mut link = Link::open(two_nodes(&first, &second), || ());
+    let mut socket = first.accept();
+    send_hello(&mut socket, &hello("a"));
+    wait_for("the hello", || link.take_news().connected);
+    let broken_at = Instant::now();
+    drop(socket);
+    let mut socket = second.accept();
+    send_hello(&mut socket, &hello("a"));
+    socket.send(Message::binary(packets(1).remove(0))).unwrap();
+    frames(&mut link, 1);
+    assert!(broken_at.elapsed() < Duration::from_millis(500), "{:?}", broken_at.elapsed());
+    assert_eq!(link.stats().connects, 2);
+    // And back again.
+    drop(socket);
+    send_hello(&mut first.accept(), &hello("a"));
+    wait_for("the third hello", || (link.stats().connects == 3).then_some(()));
+}
+
+#[test]
+fn link_leaves_a_node_that_falls_silent_within_two_seconds() {
+    let (first, second) = (TestServer::start(), TestServer::start());
+    let mut link = Link::open(two_nodes(&first, &second), || ());
+    // Stopped: the connection stands, and nothing is ever read or sent.
+    let mut stopped = first.accept();
+    send_hello(&mut stopped, &hello("a"));
+    wait_for("the hello", || link.take_news().connected);
+    let stopped_at = Instant::now();
+    let mut socket = second.accept();
+    send_hello(&mut socket, &hello("a"));
+    socket.send(Message::binary(packets(1).remove(0))).unwrap();
+    frames(&mut link, 1);
+    assert!(stopped_at.elapsed() < Duration::from_secs(2), "{:?}", stopped_at.elapsed());
 }

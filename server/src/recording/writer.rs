@@ -145,7 +145,7 @@ impl Item {
 }
 
 /// A recording as the listing shows it.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RecorderStatus {
     /// Name of the file in the server's folder.
     pub file: String,
@@ -155,7 +155,7 @@ pub(crate) struct RecorderStatus {
     /// Messages left out because the disk was too slow.
     pub dropped: u64,
     /// Why it has ended, where it has.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<String>,
 }
 

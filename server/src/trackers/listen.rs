@@ -431,6 +431,11 @@ impl<'a> Listener<'a> {
         if now < performer.retry_at {
             return Err(performer.refusal);
         }
+        if let Some(cluster) = &self.hub.cluster {
+            let mut hello = hello(protocol, seen, ip);
+            (hello.keep_neutral, hello.slot) = (performer.num_sessions > 0, performer.slot.clone());
+            cluster.enter_soon(&self.hub.rooms, &performer.room, &hello)?;
+        }
         if performer.begun_at.is_some_and(|begun| now - begun < RETRY) || !self.begins.take_if_free(now) {
             return Err("too_many_sessions");
         }

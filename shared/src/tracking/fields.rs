@@ -48,6 +48,7 @@ pub(super) struct Fields {
     pub image: Option<[f64; 2]>,
     pub focal: Option<f64>,
     pub takeover: bool,
+    pub resume: Option<f64>,
     pub slot: Option<String>,
     pub priority: Option<f64>,
     pub groups: Option<ChannelGroups>,
@@ -94,6 +95,7 @@ impl Fields {
             image: None,
             focal: None,
             takeover: false,
+            resume: None,
             slot: None,
             priority: None,
             groups: None,
@@ -129,7 +131,7 @@ impl Fields {
         self.kind = None;
         (self.version, self.fps, self.focal, self.t) = (None, None, None, None);
         (self.source, self.layout, self.image) = (None, None, None);
-        (self.takeover, self.keep_neutral) = (false, false);
+        (self.takeover, self.resume, self.keep_neutral) = (false, None, false);
         (self.slot, self.priority, self.groups) = (None, None, None);
         (self.settings, self.change) = (None, Settings::default());
         (self.profile, self.step, self.seconds, self.name) = (None, None, None, None);
@@ -180,7 +182,7 @@ enum Key {
 }
 
 /// Every field of every message.
-const KEYS: [&str; 30] = [
+const KEYS: [&str; 31] = [
     "type",
     "t",
     "landmarks",
@@ -197,6 +199,7 @@ const KEYS: [&str; 30] = [
     "image",
     "focal",
     "takeover",
+    "resume",
     "keep_neutral",
     "slot",
     "priority",
@@ -279,6 +282,7 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
                 }
                 "focal" => fields.focal = Some(map.next_value_seed(Number("pixels"))?),
                 "takeover" => fields.takeover = map.next_value_seed(Flag)?,
+                "resume" => fields.resume = Some(map.next_value_seed(Number("a session's number"))?),
                 "slot" => fields.slot = Some(map.next_value_seed(Text("the name of a source slot"))?),
                 "priority" => fields.priority = Some(map.next_value_seed(Number("a priority, 0 to 100"))?),
                 "groups" => map.next_value_seed(Groups(fields))?,

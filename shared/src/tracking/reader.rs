@@ -154,6 +154,7 @@ impl PublishReader {
             image,
             focal: fields.focal.map(|focal| check_focal(focal, image)).transpose()?,
             takeover: fields.takeover,
+            resume: fields.resume.map(check_session).transpose()?,
             settings: check_settings(fields.settings)?,
             slot: Slot::check(fields.slot.take(), fields.priority, fields.groups)?,
             keep_neutral: fields.keep_neutral,
@@ -282,6 +283,14 @@ fn check_settings(settings: Option<Settings>) -> Result<Settings, MessageError> 
 
 fn missing(field: &str, expected: &str) -> MessageError {
     MessageError::new("missing_field", format!("field {field} is missing, expected {expected}"))
+}
+
+/// The number of a session that there may have been.
+fn check_session(session: f64) -> Result<u32, MessageError> {
+    if session.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&session) {
+        return Ok(session as u32);
+    }
+    Err(MessageError::new("out_of_range", format!("field resume is {session}, expected a whole number from 1 to {}", u32::MAX)))
 }
 
 /// A focal length in pixels that a lens can have before a picture of this size.
@@ -634,6 +643,9 @@ mod tests {
                 "field takeover: invalid type: string \"yes\", expected true or false",
             ),
             (r#"{"type":"hello","version":1,"keep_neutral":1}"#, "wrong_type", "field keep_neutral"),
+            (r#"{"type":"hello","version":1,"resume":0}"#, "out_of_range", "field resume is 0, expected a whole number from 1"),
+            (r#"{"type":"hello","version":1,"resume":1.5}"#, "out_of_range", "field resume is 1.5"),
+            (r#"{"type":"hello","version":1,"resume":"last"}"#, "wrong_type", "field resume"),
             (r#"{"type":"hello","version":1,"slot":"a b"}"#, "out_of_range", "field slot is \"a b\", expected 1 to 64"),
             (r#"{"type":"hello","version":1,"slot":5}"#, "wrong_type", "field slot"),
             (
@@ -664,9 +676,9 @@ mod tests {
     fn focal_lengths_that_lenses_have_are_taken() {
         for (focal, image) in [(40.0, "400,300"), (20_000.0, "400,300"), (0.1, "1,1"), (4e6, "1e5,1")] {
             let (mut reader, mut frame) = reader();
-            let text = format!(r#"{{"type":"hello","version":1,"focal":{focal},"image":[{image}],"keep_neutral":true}}"#);
+            let text = format!(r#"{{"type":"hello","version":1,"focal":{focal},"image":[{image}],"keep_neutral":true,"resume":7}}"#);
             let Ok(PublishMessage::Hello(hello)) = reader.read(&text, &mut frame) else { panic!("{text} is refused") };
-            assert_eq!((hello.focal, hello.keep_neutral), (Some(focal as f32), true));
+            assert_eq!((hello.focal, hello.keep_neutral, hello.resume), (Some(focal as f32), true, Some(7)));
         }
     }
 

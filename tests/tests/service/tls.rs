@@ -26,7 +26,7 @@ fn with_files(folder: &Path) -> Server {
 /// How a viewer's link stands once it has made up its mind.
 fn watch(server: &Server, host: &str, trust: Trust) -> LinkState {
     let options = LinkOptions {
-        server: format!("wss://{host}:{}", server.address.port()).parse().unwrap(),
+        servers: format!("wss://{host}:{}", server.address.port()).parse().unwrap(),
         room: RoomName::new("demo").unwrap(),
         trust,
         token: None,
@@ -92,7 +92,7 @@ fn a_certificate_that_changes_is_read_again_and_nobody_is_cut_off() {
     let first = write_certificate(folder.path());
     let server = with_files(folder.path());
     let options = LinkOptions {
-        server: format!("wss://localhost:{}", server.address.port()).parse().unwrap(),
+        servers: format!("wss://localhost:{}", server.address.port()).parse().unwrap(),
         room: RoomName::new("demo").unwrap(),
         trust: Trust::Fingerprint(first),
         token: None,

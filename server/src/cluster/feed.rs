@@ -1,0 +1,219 @@
+//! What a node's viewers watch that has its home elsewhere: one subscription a room, for as long as somebody watches.
+
+use super::wire::{StateHead, split};
+use super::{Cluster, REQUEST_TIMEOUT};
+use crate::room::{Fed, Room, Rooms};
+use futures_util::StreamExt;
+use rhytid_shared::RoomName;
+use std::collections::HashMap;
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
+use tokio::task::JoinHandle;
+use tokio_tungstenite::tungstenite::Bytes;
+
+/// How often rooms are looked through, whatever is heard of them.
+const ROUND: Duration = Duration::from_secs(1);
+/// A key packet is asked for at most this often.
+const ASK_SPACING: Duration = Duration::from_millis(100);
+
+/// Keeps the subscriptions what the viewers want.
+pub(super) async fn run(cluster: Arc<Cluster>, rooms: Weak<Rooms>) {
+    let mut feeds: HashMap<RoomName, JoinHandle<()>> = HashMap::new();
+    let mut interest = cluster.interest.subscribe();
+    loop {
+        // Only an end of the service makes it fail; then the task is stopped anyway.
+        let _ = tokio::time::timeout(ROUND, interest.changed()).await;
+        let Some(rooms) = rooms.upgrade() else { return };
+        let watched = rooms.watched();
+        feeds.retain(|room, feed| {
+            let is_wanted = watched.iter().any(|known| known.name == *room) && !cluster.is_home(room) && !feed.is_finished();
+            if !is_wanted {
+                feed.abort();
+            }
+            is_wanted
+        });
+        for room in watched {
+            if !cluster.is_home(&room.name) && !feeds.contains_key(&room.name) {
+                feeds.insert(room.name.clone(), tokio::spawn(feed(cluster.clone(), room)));
+            }
+        }
+    }
+}
+
+async fn feed(cluster: Arc<Cluster>, room: Arc<Room>) {
+    let Ok(mut packets) = cluster.client.subscribe(cluster.packets_of(&room.name)).await else { return };
+    let mut homes = cluster.homes.subscribe();
+    homes.mark_changed();
+    let mut asked = (None, 0);
+    let mut asked_at: Option<Instant> = None;
+    loop {
+        let needs_key = tokio::select! {
+            message = packets.next() => match message {
+                Some(message) => take(&room, &message.payload) == Fed::NeedsKey,
+                None => return,
+            },
+            changed = homes.changed() => {
+                if changed.is_err() {
+                    return;
+                }
+                // After the subscription, so that nothing lies between what is asked for and what comes; and again when the home
+                // or the connection is another.
+                let asks = (cluster.home_elsewhere(&room.name), cluster.connection());
+                let is_new = asks.0.is_some() && asks != asked;
+                asked = asks;
+                if is_new {
+                    asked_at = None;
+                }
+                is_new
+            }
+        };
+        if needs_key && asked_at.is_none_or(|at| at.elapsed() >= ASK_SPACING) {
+            asked_at = Some(Instant::now());
+            ask(&cluster, &room).await;
+        }
+    }
+}
+
+fn take(room: &Room, message: &Bytes) -> Fed {
+    match StateHead::read(message) {
+        Some((head, packet)) => room.feed(head, packet),
+        None => Fed::Old,
+    }
+}
+
+/// Asks the room's home for its newest state.
+async fn ask(cluster: &Cluster, room: &Room) {
+    let Some(home) = cluster.home_elsewhere(&room.name) else { return };
+    let subject = cluster.subject(&format!("node.{home}.state"));
+    let request = cluster.client.request(subject, room.name.as_str().to_owned().into());
+    if let Ok(Ok(answer)) = tokio::time::timeout(REQUEST_TIMEOUT, request).await {
+        for message in split(answer.payload) {
+            take(room, &message);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Outbound, Outlet};
+    use super::*;
+    use crate::metrics::Metrics;
+    use crate::recording::{RecordConfig, Recorder};
+    use crate::room::{Others, Publishing, RoomError, SlotClaim};
+    use rhytid_shared::packet::{Decoder, PacketLayout};
+    use rhytid_shared::view::ViewHello;
+    use rhytid_shared::{Character, FaceFrame};
+    use tokio::sync::{mpsc, watch};
+
+    /// A node's rooms, and what leaves them for other nodes.
+    fn node() -> (Arc<Rooms>, mpsc::Receiver<Outbound>, PacketLayout) {
+        let character = Arc::new(Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap());
+        let (outlet, outbound) = mpsc::channel(64);
+        let others = Others { outlet: Outlet(outlet), interest: watch::Sender::new(()) };
+        let layout = PacketLayout::from(&*character);
+        let metrics = Arc::new(Metrics::new());
+        let recorder = Recorder::new(RecordConfig::default(), &character, metrics.clone(), mpsc::channel(1).0);
+        (Arc::new(Rooms::new(character, 4, 4, metrics, Arc::new(recorder), Some(others))), outbound, layout)
+    }
+
+    fn name() -> RoomName {
+        RoomName::new("demo").unwrap()
+    }
+
+    fn publish(rooms: &Rooms, layout: &PacketLayout, count: u32) -> Publishing {
+        let (place, _evicted) =
+            rooms.claim(&name(), SlotClaim { takeover: true, ..SlotClaim::default() }, mpsc::channel(1).0, |_| Vec::new()).unwrap();
+        for seq in 0..count {
+            let captured_at_micros = 40_000 * u64::from(seq);
+            let frame = FaceFrame { session: place.session, seq, captured_at_micros, face: true, ..layout.frame_at_rest() };
+            place.publish(&frame, None);
+        }
+        place
+    }
+
+    fn sent(outbound: &mut mpsc::Receiver<Outbound>) -> Vec<(StateHead, Bytes)> {
+        std::iter::from_fn(|| outbound.try_recv().ok()).map(|sent| StateHead::read(&sent.message).unwrap()).collect()
+    }
+
+    #[test]
+    fn what_comes_twice_late_or_under_an_older_epoch_is_not_shown() {
+        let (home, mut outbound, layout) = node();
+        home.lead(&name(), 7, 0);
+        let _first = publish(&home, &layout, 3);
+        let packets = sent(&mut outbound);
+        home.lead(&name(), 8, 1000);
+        let _second = publish(&home, &layout, 1);
+        let newer = sent(&mut outbound);
+
+        let (other, ..) = node();
+        let viewing = other.join(&name()).unwrap();
+        let feed = |(head, packet): &(StateHead, Bytes)| viewing.room.feed(*head, packet.clone());
+        assert_eq!(feed(&packets[1]), Fed::NeedsKey, "a delta before its key packet");
+        assert_eq!((feed(&packets[0]), feed(&packets[2])), (Fed::Taken, Fed::Taken));
+        assert_eq!((feed(&packets[2]), feed(&packets[1])), (Fed::Old, Fed::Old), "twice, and late");
+        assert_eq!(feed(&newer[0]), Fed::Taken);
+        let late = StateHead { index: 1_000_000, key_index: 1_000_000, ..packets[0].0 };
+        assert_eq!(viewing.room.feed(late, packets[0].1.clone()), Fed::Old, "from a home that does not know that it is none");
+    }
+
+    #[test]
+    fn what_cannot_be_read_goes_no_further_and_ends_nobody() {
+        let (home, mut outbound, layout) = node();
+        home.lead(&name(), 7, 0);
+        let _place = publish(&home, &layout, 2);
+        let packets = sent(&mut outbound);
+        let (other, ..) = node();
+        let viewing = other.join(&name()).unwrap();
+        let room = &viewing.room;
+        assert_eq!(room.feed(packets[0].0, Bytes::from_static(b"\x10nonsense")), Fed::Broken);
+        assert!(viewing.slot.borrow().is_none());
+        assert_eq!(room.feed(packets[0].0, packets[0].1.clone()), Fed::Taken, "what is whole is taken all the same");
+        // A delta that says it is a key packet.
+        let head = StateHead { index: 9, key_index: 9, ..packets[1].0 };
+        assert_eq!(room.feed(head, packets[1].1.clone()), Fed::Broken);
+        let character = Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap();
+        let latest = viewing.slot.borrow().clone().unwrap();
+        assert!(latest.json(&layout, &ViewHello::new("", &character, String::new()).character).contains("\"seq\":0"));
+    }
+
+    #[test]
+    fn fresh_home_does_not_tell_what_it_was_told_as_its_own() {
+        let (home, mut outbound, layout) = node();
+        home.lead(&name(), 7, 0);
+        let _place = publish(&home, &layout, 2);
+        let (next, ..) = node();
+        let viewing = next.join(&name()).unwrap();
+        for (head, packet) in sent(&mut outbound) {
+            viewing.room.feed(head, packet);
+        }
+        assert!(next.newest(&name()).is_empty(), "it is not the home");
+        next.lead(&name(), 8, 1000);
+        assert!(next.newest(&name()).is_empty(), "nothing was published here yet");
+        let place = publish(&next, &layout, 2);
+        assert!(place.session > 1000);
+        let newest = next.newest(&name());
+        let (mut decoder, mut frame) = (Decoder::new(layout.clone()), layout.frame_at_rest());
+        for message in &newest {
+            let (head, packet) = StateHead::read(message).unwrap();
+            assert_eq!(head.epoch, 8);
+            decoder.decode(&packet, &mut frame).unwrap();
+        }
+        assert_eq!((frame.session, frame.seq), (place.session, 1));
+    }
+
+    #[test]
+    fn who_comes_back_takes_its_own_session_over_and_no_other() {
+        let (rooms, _outbound, layout) = node();
+        let claim = |resume| rooms.claim(&name(), SlotClaim { resume, ..SlotClaim::default() }, mpsc::channel(1).0, |_| Vec::new());
+        assert_eq!(claim(None).err(), Some(RoomError::Elsewhere), "the room's home is not here");
+        rooms.lead(&name(), 7, 0);
+        let first = publish(&rooms, &layout, 1);
+        assert_eq!(claim(Some(first.session + 1)).err(), Some(RoomError::Taken));
+        let (second, _evicted) = claim(Some(first.session)).unwrap();
+        assert!(second.session > first.session);
+        // One that is not the home any more has no publishers.
+        rooms.evict(&name(), Some(8));
+        assert!(rooms.slots(&name()).is_empty());
+        assert!(!second.publish(&layout.frame_at_rest(), None), "its frames go nowhere");
+    }
+}
