@@ -1,19 +1,27 @@
 //! Rooms: where one publisher's packets meet any number of viewers. A room holds one state, the newest; nothing queues.
 
+mod listing;
+mod nodes;
+mod recorded;
+
 use crate::cluster::{Kept, Outlet, StateHead};
 use crate::metrics::Metrics;
-use crate::recording::{Item, RecordError, Recorder, RecorderStatus, SessionEvent, Sink};
+use crate::recording::{Item, Recorder, SessionEvent, Sink};
 use crate::solve::mix::Mixer;
 use crate::source::Control;
 use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
-use rhytid_shared::{ChannelGroups, Character, FaceFrame, PublishHello, RoomName, Slot};
-use serde::{Deserialize, Serialize};
+use rhytid_shared::{Character, FaceFrame, PublishHello, RoomName, Slot};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_tungstenite::tungstenite::{Bytes, Utf8Bytes};
+
+pub(crate) use listing::{RoomListing, merge};
+pub(crate) use nodes::{Fed, Others};
+
+use nodes::FedState;
 
 /// The newest state of a room, shared by all its viewers.
 pub(crate) struct Latest {
@@ -113,14 +121,6 @@ pub(crate) struct Rooms {
     others: Option<Others>,
 }
 
-/// What rooms need of other nodes.
-pub(crate) struct Others {
-    /// Where packets leave for them.
-    pub outlet: Outlet,
-    /// Told when a room's viewers come or go.
-    pub interest: watch::Sender<()>,
-}
-
 /// One room.
 pub(crate) struct Room {
     pub name: RoomName,
@@ -164,28 +164,6 @@ struct RoomState {
     fed: Option<Box<FedState>>,
 }
 
-/// The newest state that came from another node.
-struct FedState {
-    head: StateHead,
-    /// Epoch and index of the key packet that its deltas need.
-    key: (u64, u64),
-    decoder: Decoder,
-    frame: FaceFrame,
-}
-
-/// What became of another node's packet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Fed {
-    /// It is the room's newest state.
-    Taken,
-    /// It is no newer than what has been shown, or this node is the home.
-    Old,
-    /// It needs a key packet that did not come.
-    NeedsKey,
-    /// It cannot be read.
-    Broken,
-}
-
 /// The neutral face that a session came to: kept so that a publisher which comes back need not be searched again.
 struct Neutral {
     session: u32,
@@ -200,64 +178,6 @@ struct Publisher {
     num_frames: u64,
     evict: oneshot::Sender<()>,
     controls: mpsc::Sender<Control>,
-}
-
-/// A room as `/api/rooms` lists it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(crate) struct RoomListing {
-    pub name: String,
-    viewers: usize,
-    /// Publishers the room has had.
-    session: u32,
-    /// The one of the highest priority.
-    publisher: Option<PublisherListing>,
-    sources: Vec<SourceListing>,
-    frame: Option<FrameListing>,
-    /// The neutral face that the room keeps.
-    neutral: Option<NeutralListing>,
-    /// The recording being made of it, or the last one where that has failed.
-    recording: Option<RecorderStatus>,
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct PublisherListing {
-    source: String,
-    seconds: f64,
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct SourceListing {
-    slot: String,
-    source: String,
-    priority: u8,
-    groups: Vec<String>,
-    /// It has shown a face in the last half second.
-    live: bool,
-    /// The groups it drives now.
-    drives: Vec<String>,
-    seconds: f64,
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct FrameListing {
-    seq: u32,
-    t: f64,
-    face: bool,
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct NeutralListing {
-    /// The session that came to it, and the time on its sender's clock, seconds.
-    session: u32,
-    t: f64,
-    /// Frames it is the median of.
-    num_frames: usize,
-    /// The publisher asked for it.
-    requested: bool,
-}
-
-fn names_of(groups: ChannelGroups) -> Vec<String> {
-    groups.iter().map(|group| group.name().to_owned()).collect()
 }
 
 /// A lock that a panicking holder left is still whole: every change under it is complete at each step.
@@ -344,17 +264,6 @@ impl Rooms {
         Ok((Publishing { room, session }, evicted))
     }
 
-    /// Begins the recording of a room that is recorded without being asked to. Waits for nothing.
-    fn record_by_itself(&self, room: &Room, state: &mut RoomState) {
-        match self.recorder.start(&room.name, room.since) {
-            Ok((sink, _)) => room.begin_recording(state, sink),
-            Err(error) => {
-                self.metrics.recording_failures.inc();
-                tracing::error!(room = %room.name, %error, "the room is not recorded");
-            }
-        }
-    }
-
     /// The room, made where there is none.
     pub fn room(&self, name: &RoomName) -> Result<Arc<Room>, RoomError> {
         self.find_or_make(&mut lock(&self.by_name), name)
@@ -413,99 +322,6 @@ impl Rooms {
         state.neutrals.get(&hello.slot.name).filter(|neutral| neutral.kept.tracker == hello.tracker()).map(|neutral| neutral.kept.clone())
     }
 
-    /// True where something is kept of a room's slot.
-    pub fn has_kept(&self, name: &RoomName, slot: &str) -> bool {
-        self.find(name).is_some_and(|room| lock(&room.state).neutrals.contains_key(slot))
-    }
-
-    /// Takes over what other nodes keep of a room's slot.
-    pub fn restore(&self, name: &RoomName, slot: &str, kept: Kept) {
-        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
-        let mut state = lock(&room.state);
-        if state.neutrals.len() < MAX_SLOTS || state.neutrals.contains_key(slot) {
-            state.neutrals.insert(slot.to_owned(), Neutral { session: 0, kept });
-        }
-    }
-
-    /// Forgets what is kept of a room: another node, which was its home, knows better.
-    pub fn forget_kept(&self, name: &RoomName) {
-        if let Some(room) = self.find(name) {
-            lock(&room.state).neutrals.clear();
-        }
-    }
-
-    /// Slots of a room that are taken, each with its session.
-    pub fn slots(&self, name: &RoomName) -> Vec<(String, u32)> {
-        let Some(room) = self.find(name) else { return Vec::new() };
-        lock(&room.state).publishers.iter().map(|publisher| (publisher.claim.slot.name.clone(), publisher.session)).collect()
-    }
-
-    /// The greatest number that a session of a room has had, as far as is known here.
-    pub fn num_sessions(&self, name: &RoomName) -> u32 {
-        self.find(name).map_or(0, |room| lock(&room.state).num_sessions)
-    }
-
-    /// A room's newest state as messages for another node: the key packet, and the delta where there is one.
-    pub fn newest(&self, name: &RoomName) -> Vec<Bytes> {
-        let Some(room) = self.find(name) else { return Vec::new() };
-        let state = lock(&room.state);
-        let is_own = |latest: &Arc<Latest>| state.is_home && latest.key.index > state.num_states_before;
-        let Some(latest) = room.slot.borrow().clone().filter(is_own) else { return Vec::new() };
-        let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
-        let key = head(latest.key.index).message(&latest.key.bytes);
-        latest.delta.iter().fold(vec![key], |mut messages, delta| {
-            messages.push(head(latest.index).message(delta));
-            messages
-        })
-    }
-
-    /// This node is a room's home from now on, under `epoch`; others may have had `sessions` sessions of it.
-    pub fn lead(&self, name: &RoomName, epoch: u64, sessions: u32) {
-        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
-        let mut state = lock(&room.state);
-        if !std::mem::replace(&mut state.is_home, true) {
-            state.num_states_before = state.num_states;
-        }
-        state.epoch = epoch;
-        state.num_sessions = state.num_sessions.max(sessions);
-    }
-
-    /// This node is a room's home no longer, unless somebody publishes to it.
-    pub fn give_up(&self, name: &RoomName) -> bool {
-        let Some(room) = self.find(name) else { return true };
-        let mut state = lock(&room.state);
-        if state.publishers.is_empty() {
-            state.is_home = false;
-        }
-        !state.is_home
-    }
-
-    /// Sends a room's publishers away: another node is its home, under `epoch` where that is known.
-    pub fn evict(&self, name: &RoomName, epoch: Option<u64>) {
-        let Some(room) = self.find(name) else { return };
-        let mut state = lock(&room.state);
-        state.is_home = false;
-        if let Some(epoch) = epoch {
-            // Where both were cut off from each other, this one's may be the greater.
-            state.epoch = epoch;
-            if state.fed.as_ref().is_some_and(|fed| fed.head.epoch > epoch) {
-                state.fed = None;
-            }
-        }
-        for publisher in std::mem::take(&mut state.publishers) {
-            state.mixer.leave(publisher.session);
-            self.metrics.publishers.dec();
-            // Its task may have ended in this moment.
-            let _ = publisher.evict.send(());
-        }
-        state.empty_since = Instant::now();
-    }
-
-    /// Rooms that somebody watches here.
-    pub fn watched(&self) -> Vec<Arc<Room>> {
-        lock(&self.by_name).values().filter(|room| lock(&room.state).num_viewers > 0).cloned().collect()
-    }
-
     /// Removes rooms that have been without publisher and viewers for `idle`.
     pub fn sweep(&self, idle: Duration) {
         let mut by_name = lock(&self.by_name);
@@ -522,26 +338,6 @@ impl Rooms {
             room.slot.send_modify(|_| {});
         }
     }
-
-    /// All rooms, by name.
-    pub fn list(&self) -> Vec<RoomListing> {
-        let rooms: Vec<Arc<Room>> = lock(&self.by_name).values().cloned().collect();
-        rooms.iter().map(|room| room.listing()).collect()
-    }
-}
-
-impl RoomState {
-    /// True while what happens is recorded.
-    fn is_recorded(&self) -> bool {
-        self.recording.as_ref().is_some_and(|sink| !sink.has_ended())
-    }
-}
-
-impl Publisher {
-    /// What a recording says of its end.
-    fn end(&self) -> Item {
-        Item::Event(SessionEvent::End { session: self.session, frames: self.num_frames })
-    }
 }
 
 impl Room {
@@ -555,155 +351,15 @@ impl Room {
         mixer_time(self.nanos())
     }
 
-    /// Records what `item` gives, where the room is recorded.
-    fn record(&self, state: &RoomState, item: impl FnOnce() -> Item) {
-        if let Some(sink) = &state.recording {
-            sink.put(self.nanos(), item());
-        }
-    }
-
-    /// True while what happens here is recorded.
-    pub fn is_recorded(&self) -> bool {
-        lock(&self.state).is_recorded()
-    }
-
-    /// Records into `sink` from now on.
-    pub fn record_into(&self, sink: Arc<Sink>) -> Result<(), RecordError> {
-        let mut state = lock(&self.state);
-        if state.is_recorded() {
-            return Err(RecordError::Running);
-        }
-        self.begin_recording(&mut state, sink);
-        Ok(())
-    }
-
-    /// Publishers that are there are noted as under way, with the state that their packets refer to.
-    fn begin_recording(&self, state: &mut RoomState, sink: Arc<Sink>) {
-        for Publisher { session, claim, .. } in &state.publishers {
-            let event = SessionEvent::Start {
-                session: *session,
-                slot: claim.slot.name.clone(),
-                source: claim.source.clone(),
-                under_way: true,
-                kept_neutral: None,
-                profile: None,
-                solve: None,
-            };
-            sink.put(self.nanos(), Item::Event(event));
-        }
-        if let Some(key) = state.key.as_ref().filter(|_| !state.publishers.is_empty()) {
-            sink.put(self.nanos(), Item::Packet(key.bytes.clone()));
-        }
-        state.recording = Some(sink);
-    }
-
     /// When its clock began.
     pub fn since(&self) -> Instant {
         self.since
-    }
-
-    /// How its recording stands.
-    pub fn recording(&self) -> Option<RecorderStatus> {
-        lock(&self.state).recording.as_ref().map(|sink| sink.status())
-    }
-
-    /// Ends the recording; its file is finished by its own thread.
-    pub fn end_recording(&self) -> Option<RecorderStatus> {
-        let sink = lock(&self.state).recording.take()?;
-        sink.put(self.nanos(), Item::Event(SessionEvent::Stop { reason: "asked to".into() }));
-        Some(sink.status())
-    }
-
-    /// Takes a packet that came from the room's home at another node.
-    pub fn feed(&self, head: StateHead, packet: Bytes) -> Fed {
-        let mut guard = lock(&self.state);
-        let state = &mut *guard;
-        if state.is_home || head.epoch < state.epoch || state.fed.as_ref().is_some_and(|fed| head <= fed.head) {
-            return Fed::Old;
-        }
-        let is_key = head.index == head.key_index;
-        let key = (head.epoch, head.key_index);
-        let fed = match &mut state.fed {
-            Some(fed) if is_key || fed.key == key => fed,
-            empty @ None if is_key => empty.insert(Box::new(FedState {
-                head: StateHead { epoch: 0, index: 0, key_index: 0 },
-                key: (0, 0),
-                decoder: Decoder::new(self.layout.clone()),
-                frame: self.layout.frame_at_rest(),
-            })),
-            _ => return Fed::NeedsKey,
-        };
-        // Here, once for all viewers: what cannot be read goes no further.
-        let is_sound = match fed.decoder.decode(&packet, &mut fed.frame) {
-            Ok(kind) => (kind == PacketKind::Key) == is_key,
-            Err(_) => false,
-        };
-        let (delta, key_packet) = match (&state.key, is_key) {
-            _ if !is_sound => {
-                // Its decoder may hold another key packet than is noted.
-                state.fed = None;
-                self.metrics.drop_frames("bad_cluster_packet", 1);
-                return Fed::Broken;
-            }
-            (_, true) => (None, Arc::new(KeyPacket { index: state.num_states + 1, bytes: packet })),
-            (Some(key), false) => (Some(packet), key.clone()),
-            (None, false) => return Fed::NeedsKey,
-        };
-        (fed.head, fed.key) = (head, key);
-        state.shown = Some((fed.frame.seq, fed.frame.captured_at_micros, fed.frame.face));
-        state.num_sessions = state.num_sessions.max(fed.frame.session);
-        state.epoch = head.epoch;
-        state.key = Some(key_packet.clone());
-        state.num_states += 1;
-        self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key: key_packet, delta, json: OnceLock::new() })));
-        Fed::Taken
     }
 
     /// Where commands to the source in this slot go.
     pub fn controls(&self, slot: &str) -> Option<mpsc::Sender<Control>> {
         let state = lock(&self.state);
         state.publishers.iter().find(|publisher| publisher.claim.slot.name == slot).map(|publisher| publisher.controls.clone())
-    }
-
-    /// Who publishes to it and who watches.
-    pub fn listing(&self) -> RoomListing {
-        let state = lock(&self.state);
-        let now = self.now();
-        let first = state.publishers.iter().max_by_key(|publisher| (publisher.claim.slot.priority, publisher.session));
-        let newest_neutral = state.neutrals.values().max_by_key(|neutral| neutral.session);
-        RoomListing {
-            name: self.name.to_string(),
-            viewers: state.num_viewers,
-            session: state.num_sessions,
-            publisher: first.map(|publisher| PublisherListing {
-                source: publisher.claim.source.clone(),
-                seconds: publisher.since.elapsed().as_secs_f64(),
-            }),
-            sources: state
-                .publishers
-                .iter()
-                .map(|Publisher { session, claim, since, .. }| {
-                    let (live, drives) = state.mixer.state_of(*session, now);
-                    SourceListing {
-                        slot: claim.slot.name.clone(),
-                        source: claim.source.clone(),
-                        priority: claim.slot.priority,
-                        groups: names_of(claim.slot.groups),
-                        live,
-                        drives: names_of(drives),
-                        seconds: since.elapsed().as_secs_f64(),
-                    }
-                })
-                .collect(),
-            frame: state.shown.map(|(seq, micros, face)| FrameListing { seq, t: micros as f64 / 1e6, face }),
-            neutral: newest_neutral.map(|Neutral { session, kept: Kept { calibration, .. } }| NeutralListing {
-                session: *session,
-                t: calibration.t,
-                num_frames: calibration.num_frames,
-                requested: calibration.requested,
-            }),
-            recording: state.recording.as_ref().map(|sink| sink.status()),
-        }
     }
 }
 
@@ -828,38 +484,6 @@ impl Drop for Publishing {
             self.room.metrics.publishers.dec();
         }
     }
-}
-
-/// A room of the cluster as `/api/rooms` lists it.
-#[derive(Debug, Serialize)]
-pub(crate) struct ClusterListing {
-    #[serde(flatten)]
-    room: RoomListing,
-    /// Its home, or one where somebody watches.
-    node: String,
-    /// Viewers by node, where there are any.
-    nodes: BTreeMap<String, usize>,
-}
-
-/// All nodes' listings in one, by name: the room as its home tells of it, viewers summed up.
-pub(crate) fn merge(node: &str, own: Vec<RoomListing>, elsewhere: Vec<(String, RoomListing)>) -> Vec<ClusterListing> {
-    let mut by_name: BTreeMap<String, ClusterListing> = BTreeMap::new();
-    for (node, room) in own.into_iter().map(|room| (node.to_owned(), room)).chain(elsewhere) {
-        let viewers = room.viewers;
-        let listed = by_name.entry(room.name.clone()).or_insert_with(|| ClusterListing {
-            room: room.clone(),
-            node: node.clone(),
-            nodes: BTreeMap::new(),
-        });
-        if listed.room.publisher.is_none() && room.publisher.is_some() {
-            (listed.room, listed.node) = (room, node.clone());
-        }
-        if viewers > 0 {
-            listed.nodes.insert(node, viewers);
-        }
-        listed.room.viewers = listed.nodes.values().sum();
-    }
-    by_name.into_values().collect()
 }
 
 #[cfg(test)]

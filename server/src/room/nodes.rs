@@ -1,0 +1,183 @@
+//! Rooms among nodes: which of them is a room's home, what goes to the others and what comes from them.
+
+use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, Rooms, lock};
+use crate::cluster::{Kept, Outlet, StateHead};
+use rhytid_shared::packet::{Decoder, PacketKind};
+use rhytid_shared::{FaceFrame, RoomName};
+use std::sync::{Arc, OnceLock};
+use std::time::Instant;
+use tokio::sync::watch;
+use tokio_tungstenite::tungstenite::Bytes;
+
+/// What rooms need of other nodes.
+pub(crate) struct Others {
+    /// Where packets leave for them.
+    pub outlet: Outlet,
+    /// Told when a room's viewers come or go.
+    pub interest: watch::Sender<()>,
+}
+
+/// The newest state that came from another node.
+pub(super) struct FedState {
+    head: StateHead,
+    /// Epoch and index of the key packet that its deltas need.
+    key: (u64, u64),
+    decoder: Decoder,
+    frame: FaceFrame,
+}
+
+/// What became of another node's packet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Fed {
+    /// It is the room's newest state.
+    Taken,
+    /// It is no newer than what has been shown, or this node is the home.
+    Old,
+    /// It needs a key packet that did not come.
+    NeedsKey,
+    /// It cannot be read.
+    Broken,
+}
+
+impl Rooms {
+    /// True where something is kept of a room's slot.
+    pub fn has_kept(&self, name: &RoomName, slot: &str) -> bool {
+        self.find(name).is_some_and(|room| lock(&room.state).neutrals.contains_key(slot))
+    }
+
+    /// Takes over what other nodes keep of a room's slot.
+    pub fn restore(&self, name: &RoomName, slot: &str, kept: Kept) {
+        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
+        let mut state = lock(&room.state);
+        if state.neutrals.len() < MAX_SLOTS || state.neutrals.contains_key(slot) {
+            state.neutrals.insert(slot.to_owned(), Neutral { session: 0, kept });
+        }
+    }
+
+    /// Forgets what is kept of a room: another node, which was its home, knows better.
+    pub fn forget_kept(&self, name: &RoomName) {
+        if let Some(room) = self.find(name) {
+            lock(&room.state).neutrals.clear();
+        }
+    }
+
+    /// Slots of a room that are taken, each with its session.
+    pub fn slots(&self, name: &RoomName) -> Vec<(String, u32)> {
+        let Some(room) = self.find(name) else { return Vec::new() };
+        lock(&room.state).publishers.iter().map(|publisher| (publisher.claim.slot.name.clone(), publisher.session)).collect()
+    }
+
+    /// The greatest number that a session of a room has had, as far as is known here.
+    pub fn num_sessions(&self, name: &RoomName) -> u32 {
+        self.find(name).map_or(0, |room| lock(&room.state).num_sessions)
+    }
+
+    /// A room's newest state as messages for another node: the key packet, and the delta where there is one.
+    pub fn newest(&self, name: &RoomName) -> Vec<Bytes> {
+        let Some(room) = self.find(name) else { return Vec::new() };
+        let state = lock(&room.state);
+        let is_own = |latest: &Arc<Latest>| state.is_home && latest.key.index > state.num_states_before;
+        let Some(latest) = room.slot.borrow().clone().filter(is_own) else { return Vec::new() };
+        let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
+        let key = head(latest.key.index).message(&latest.key.bytes);
+        latest.delta.iter().fold(vec![key], |mut messages, delta| {
+            messages.push(head(latest.index).message(delta));
+            messages
+        })
+    }
+
+    /// This node is a room's home from now on, under `epoch`; others may have had `sessions` sessions of it.
+    pub fn lead(&self, name: &RoomName, epoch: u64, sessions: u32) {
+        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
+        let mut state = lock(&room.state);
+        if !std::mem::replace(&mut state.is_home, true) {
+            state.num_states_before = state.num_states;
+        }
+        state.epoch = epoch;
+        state.num_sessions = state.num_sessions.max(sessions);
+    }
+
+    /// This node is a room's home no longer, unless somebody publishes to it.
+    pub fn give_up(&self, name: &RoomName) -> bool {
+        let Some(room) = self.find(name) else { return true };
+        let mut state = lock(&room.state);
+        if state.publishers.is_empty() {
+            state.is_home = false;
+        }
+        !state.is_home
+    }
+
+    /// Sends a room's publishers away: another node is its home, under `epoch` where that is known.
+    pub fn evict(&self, name: &RoomName, epoch: Option<u64>) {
+        let Some(room) = self.find(name) else { return };
+        let mut state = lock(&room.state);
+        state.is_home = false;
+        if let Some(epoch) = epoch {
+            // Where both were cut off from each other, this one's may be the greater.
+            state.epoch = epoch;
+            if state.fed.as_ref().is_some_and(|fed| fed.head.epoch > epoch) {
+                state.fed = None;
+            }
+        }
+        for publisher in std::mem::take(&mut state.publishers) {
+            room.record(&state, || publisher.end());
+            state.mixer.leave(publisher.session);
+            self.metrics.publishers.dec();
+            // Its task may have ended in this moment.
+            let _ = publisher.evict.send(());
+        }
+        state.empty_since = Instant::now();
+    }
+
+    /// Rooms that somebody watches here.
+    pub fn watched(&self) -> Vec<Arc<Room>> {
+        lock(&self.by_name).values().filter(|room| lock(&room.state).num_viewers > 0).cloned().collect()
+    }
+}
+
+impl Room {
+    /// Takes a packet that came from the room's home at another node.
+    pub fn feed(&self, head: StateHead, packet: Bytes) -> Fed {
+        let mut guard = lock(&self.state);
+        let state = &mut *guard;
+        if state.is_home || head.epoch < state.epoch || state.fed.as_ref().is_some_and(|fed| head <= fed.head) {
+            return Fed::Old;
+        }
+        let is_key = head.index == head.key_index;
+        let key = (head.epoch, head.key_index);
+        let fed = match &mut state.fed {
+            Some(fed) if is_key || fed.key == key => fed,
+            empty @ None if is_key => empty.insert(Box::new(FedState {
+                head: StateHead { epoch: 0, index: 0, key_index: 0 },
+                key: (0, 0),
+                decoder: Decoder::new(self.layout.clone()),
+                frame: self.layout.frame_at_rest(),
+            })),
+            _ => return Fed::NeedsKey,
+        };
+        // Here, once for all viewers: what cannot be read goes no further.
+        let is_sound = match fed.decoder.decode(&packet, &mut fed.frame) {
+            Ok(kind) => (kind == PacketKind::Key) == is_key,
+            Err(_) => false,
+        };
+        let (delta, key_packet) = match (&state.key, is_key) {
+            _ if !is_sound => {
+                // Its decoder may hold another key packet than is noted.
+                state.fed = None;
+                self.metrics.drop_frames("bad_cluster_packet", 1);
+                return Fed::Broken;
+            }
+            (_, true) => (None, Arc::new(KeyPacket { index: state.num_states + 1, bytes: packet })),
+            (Some(key), false) => (Some(packet), key.clone()),
+            (None, false) => return Fed::NeedsKey,
+        };
+        (fed.head, fed.key) = (head, key);
+        state.shown = Some((fed.frame.seq, fed.frame.captured_at_micros, fed.frame.face));
+        state.num_sessions = state.num_sessions.max(fed.frame.session);
+        state.epoch = head.epoch;
+        state.key = Some(key_packet.clone());
+        state.num_states += 1;
+        self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key: key_packet, delta, json: OnceLock::new() })));
+        Fed::Taken
+    }
+}
