@@ -18,6 +18,7 @@ pub mod osc;
 pub(crate) mod session;
 pub mod sniff;
 pub(crate) mod spec;
+pub mod table;
 pub mod vmc;
 pub(crate) mod vmc_out;
 pub mod vts;

@@ -6,15 +6,13 @@
 //! 13:13:04:31.652,61,0.1236470118,…                  hours:minutes:seconds:frame.thousandths of a frame, 60 frames a second
 //! ```
 
+use super::table::{Rows, Table};
 use super::{Refusal, livelink, weight};
 use rhytid_shared::{ARKIT_NAMES, ArkitShape, NUM_ARKIT_SHAPES};
 use std::fmt::Write;
-use std::io::{self, BufRead, Read};
 
 /// Frames a second that a timecode counts.
 const RATE: f64 = 60.0;
-/// Longest line, bytes: a header of 70 names takes 1,200.
-const LONGEST_LINE: u64 = 16 << 10;
 /// Most columns.
 const MOST_COLUMNS: usize = 256;
 const DAY: f64 = 86_400.0;
@@ -31,53 +29,39 @@ enum Column {
 }
 
 /// Reads a recording as the lines of a feed: a hello, then one frame a row.
-pub struct LiveLinkCsv<R> {
-    lines: R,
+pub type LiveLinkCsv<R> = Table<R, Recording>;
+
+/// What is known of the recording from the rows before.
+#[derive(Default)]
+pub struct Recording {
+    /// Of the header; empty before it.
     columns: Vec<Column>,
-    line: usize,
     last_t: Option<f64>,
     /// Seconds of the days that have passed.
     days: f64,
-    /// What has not been given yet.
-    text: Vec<u8>,
-    at: usize,
 }
 
-impl<R: BufRead> LiveLinkCsv<R> {
-    /// A reader that begins with the header's line.
-    pub fn new(lines: R) -> Self {
-        Self { lines, columns: Vec::new(), line: 0, last_t: None, days: 0.0, text: Vec::new(), at: 0 }
-    }
+impl Rows for Recording {
+    /// A header of 70 names takes 1,200.
+    const LONGEST: u64 = 16 << 10;
 
-    /// The next line of the feed into `text`; false at the end.
-    fn next_line(&mut self) -> io::Result<bool> {
-        let wrong = |line: usize, problem: String| io::Error::new(io::ErrorKind::InvalidData, format!("line {line}: {problem}"));
-        loop {
-            let mut bytes = Vec::new();
-            self.line += 1;
-            if (&mut self.lines).take(LONGEST_LINE).read_until(b'\n', &mut bytes)? == 0 {
-                return if self.line == 1 { Err(wrong(1, "the recording is empty".into())) } else { Ok(false) };
-            }
-            if bytes.len() as u64 == LONGEST_LINE && bytes.last() != Some(&b'\n') {
-                return Err(wrong(self.line, format!("it is longer than {LONGEST_LINE} bytes")));
-            }
-            let row = std::str::from_utf8(&bytes).map_err(|_| wrong(self.line, "it is not UTF-8 text".into()))?;
-            let row = row.trim_start_matches('\u{feff}').trim_end();
-            (self.text, self.at) = (Vec::new(), 0);
-            let mut text = String::new();
-            if self.columns.is_empty() {
-                self.columns = columns(row).map_err(|problem| wrong(self.line, problem))?;
-                let _ = writeln!(text, r#"{{"type":"hello","version":1,"source":"Live Link Face recording","fps":60}}"#);
-            } else if row.is_empty() || !self.read_row(row, &mut text).map_err(|problem| wrong(self.line, problem))? {
-                continue;
-            }
-            self.text = text.into_bytes();
-            return Ok(true);
+    fn take(&mut self, row: &str, text: &mut String) -> Result<(), String> {
+        if self.columns.is_empty() {
+            self.columns = columns(row)?;
+            text.push_str("{\"type\":\"hello\",\"version\":1,\"source\":\"Live Link Face recording\",\"fps\":60}\n");
+            return Ok(());
         }
+        if row.is_empty() { Ok(()) } else { self.read_row(row, text) }
     }
 
-    /// Writes the frame of a row; false for one that adds nothing, because its time is not later than that of the row before.
-    fn read_row(&mut self, row: &str, text: &mut String) -> Result<bool, String> {
+    fn end(&self) -> Result<(), String> {
+        if self.columns.is_empty() { Err("the recording is empty".into()) } else { Ok(()) }
+    }
+}
+
+impl Recording {
+    /// Writes the frame of a row; nothing where its time is not later than that of the row before.
+    fn read_row(&mut self, row: &str, text: &mut String) -> Result<(), String> {
         let mut weights = [0.0; NUM_ARKIT_SHAPES];
         let mut head = [0.0; 3];
         let (mut t, mut has_face, mut num_values) = (None, true, 0);
@@ -103,7 +87,7 @@ impl<R: BufRead> LiveLinkCsv<R> {
                 t += DAY;
             }
             if t <= last {
-                return Ok(false);
+                return Ok(());
             }
         }
         self.last_t = Some(t);
@@ -113,7 +97,7 @@ impl<R: BufRead> LiveLinkCsv<R> {
         let _ = write!(text, r#"{{"type":"frame","t":{t}"#);
         if !has_face || num_values == 0 {
             text.push_str(",\"face\":false}\n");
-            return Ok(true);
+            return Ok(());
         }
         let num_expected = self.columns.iter().filter(|column| matches!(column, Column::Shape(_))).count();
         if num_values != num_expected {
@@ -131,7 +115,7 @@ impl<R: BufRead> LiveLinkCsv<R> {
             let _ = write!(text, r#","head":{{"rotation":[{x},{y},{z},{w}],"position":[0,0,0]}}"#);
         }
         text.push_str("}\n");
-        Ok(true)
+        Ok(())
     }
 }
 
@@ -169,23 +153,12 @@ fn seconds(timecode: &str) -> Option<f64> {
     Some((t * 1e6).round() / 1e6)
 }
 
-impl<R: BufRead> Read for LiveLinkCsv<R> {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        if self.at == self.text.len() && !self.next_line()? {
-            return Ok(0);
-        }
-        let count = buffer.len().min(self.text.len() - self.at);
-        buffer[..count].copy_from_slice(&self.text[self.at..self.at + count]);
-        self.at += count;
-        Ok(count)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::feed::{Feed, FeedItem};
     use rhytid_shared::{TrackingData, TrackingFrame};
+    use std::io::Read;
 
     fn lines(text: &str) -> Result<String, String> {
         let mut out = String::new();

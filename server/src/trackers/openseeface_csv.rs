@@ -8,13 +8,11 @@
 //! Of several faces the first of each camera frame is taken; where none is logged for a while, the feed says that there is no face.
 
 use super::openseeface::NUM_POINTS;
+use super::table::{Rows, Table};
 use std::fmt::Write;
-use std::io::{self, BufRead, Read};
 
 /// What its header begins with.
 pub const BEGINNING: &str = "Frame,Time,Width,Height,";
-/// Longest line, bytes: 453 numbers of 24 digits take 11,300.
-const LONGEST_LINE: u64 = 64 << 10;
 /// Column of the first landmark.
 const FIRST_LANDMARK: usize = 25;
 /// Rows farther apart than this, seconds, have no face between them: the tracker logs every camera frame that has one.
@@ -23,57 +21,44 @@ const LONGEST_STEP: f64 = 0.5;
 const FARTHEST: f64 = 1e5;
 
 /// Reads a log as the lines of a feed: a hello, then one frame a row.
-pub struct OpenSeeFaceCsv<R> {
-    lines: R,
-    line: usize,
+pub type OpenSeeFaceCsv<R> = Table<R, Log>;
+
+/// What is known of the log from the rows before.
+#[derive(Default)]
+pub struct Log {
+    has_header: bool,
+    /// Width and height, pixels.
     image: Option<[f64; 2]>,
     last_t: Option<f64>,
-    text: Vec<u8>,
-    at: usize,
 }
 
-impl<R: BufRead> OpenSeeFaceCsv<R> {
-    /// A reader that begins with the header's line.
-    pub fn new(lines: R) -> Self {
-        Self { lines, line: 0, image: None, last_t: None, text: Vec::new(), at: 0 }
-    }
+impl Rows for Log {
+    /// 453 numbers of 24 digits take 11,300.
+    const LONGEST: u64 = 64 << 10;
 
-    /// The next lines of the feed into `text`; false at the end.
-    fn next_lines(&mut self) -> io::Result<bool> {
-        loop {
-            let mut bytes = Vec::new();
-            self.line += 1;
-            let wrong = |problem: String| io::Error::new(io::ErrorKind::InvalidData, format!("line {}: {problem}", self.line));
-            if (&mut self.lines).take(LONGEST_LINE).read_until(b'\n', &mut bytes)? == 0 {
-                return if self.image.is_none() { Err(wrong("the log has no rows".into())) } else { Ok(false) };
+    fn take(&mut self, row: &str, text: &mut String) -> Result<(), String> {
+        if !self.has_header {
+            if !row.starts_with(BEGINNING) || row.split(',').nth(FIRST_LANDMARK) != Some("Landmark[0].X") {
+                return Err(format!("it is no header of OpenSeeFace, expected {BEGINNING}…"));
             }
-            if bytes.len() as u64 == LONGEST_LINE && bytes.last() != Some(&b'\n') {
-                return Err(wrong(format!("it is longer than {LONGEST_LINE} bytes")));
-            }
-            let row = std::str::from_utf8(&bytes).map_err(|_| wrong("it is not UTF-8 text".into()))?.trim_end();
-            if self.line == 1 {
-                if !row.starts_with(BEGINNING) || row.split(',').nth(FIRST_LANDMARK) != Some("Landmark[0].X") {
-                    return Err(wrong(format!("it is no header of OpenSeeFace, expected {BEGINNING}…")));
-                }
-                continue;
-            }
-            if row.is_empty() {
-                continue;
-            }
-            let row = Row::read(row).map_err(wrong)?;
-            let mut text = String::new();
-            if self.take(&row, &mut text) {
-                (self.text, self.at) = (text.into_bytes(), 0);
-                return Ok(true);
-            }
+            self.has_header = true;
+        } else if !row.is_empty() {
+            self.write(&Row::read(row)?, text);
         }
+        Ok(())
     }
 
-    /// Writes what a row adds to the feed; false for one that adds nothing.
-    fn take(&mut self, row: &Row, text: &mut String) -> bool {
+    fn end(&self) -> Result<(), String> {
+        self.image.map(|_| ()).ok_or_else(|| "the log has no rows".into())
+    }
+}
+
+impl Log {
+    /// Writes what a row adds to the feed.
+    fn write(&mut self, row: &Row, text: &mut String) {
         // Another face of the same picture, or a clock that was set back.
         if row.face != 0 || self.last_t.is_some_and(|last| row.t <= last) {
-            return false;
+            return;
         }
         if self.image.is_none() {
             let [width, height] = *self.image.insert(row.image);
@@ -96,7 +81,6 @@ impl<R: BufRead> OpenSeeFaceCsv<R> {
             let _ = write!(text, "{}{confidence}", if i == 0 { "" } else { "," });
         }
         text.push_str("]}\n");
-        true
     }
 }
 
@@ -140,23 +124,12 @@ impl Row {
     }
 }
 
-impl<R: BufRead> Read for OpenSeeFaceCsv<R> {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        if self.at == self.text.len() && !self.next_lines()? {
-            return Ok(0);
-        }
-        let count = buffer.len().min(self.text.len() - self.at);
-        buffer[..count].copy_from_slice(&self.text[self.at..self.at + count]);
-        self.at += count;
-        Ok(count)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::feed::{Feed, FeedItem};
     use rhytid_shared::{TrackingData, TrackingFrame};
+    use std::io::Read;
 
     fn header() -> String {
         let named = |kind: &str| (0..66).map(|i| format!(",{kind}[{i}].X,{kind}[{i}].Y,{kind}[{i}].Confidence")).collect::<String>();
@@ -175,7 +148,7 @@ mod tests {
     #[test]
     fn rows_become_frames_and_gaps_faces_that_are_lost() {
         let text = header() + &row(10.0, 0, 0.0) + &row(10.0, 1, 9.0) + &row(10.04, 0, 1.0) + "\r\n" + &row(12.0, 0, 2.0);
-        let lines = io::BufReader::new(OpenSeeFaceCsv::new(text.as_bytes()));
+        let lines = std::io::BufReader::new(OpenSeeFaceCsv::new(text.as_bytes()));
         let mut feed = Feed::new_for_any_character(lines, "log".into()).unwrap();
         assert_eq!((feed.hello.image, feed.hello.focal), (Some([640.0, 480.0]), Some(640.0)));
         let (mut frame, mut seen) = (TrackingFrame::default(), Vec::new());
