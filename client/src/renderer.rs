@@ -52,7 +52,7 @@ pub use view::{BlendError, BlendMode, NameError, Term, ViewError, ViewMode, Wrin
 use crate::asset::{CharacterAsset, Palette, Surface};
 use anatomy::{Lids, Mouth, eyeballs, gazes};
 use blood::Blood;
-use glam::{Affine3A, Vec3};
+use glam::Vec3;
 use layouts::Layouts;
 use map_pool::PooledMap;
 use pipelines::{Key, Look, Pipelines, Wire};
@@ -445,11 +445,7 @@ impl Renderer {
         // The bust stays while the head travels: a sphere that holds both.
         let travel = frame.head.position;
         let (centre, radius) = (self.bounds.centre + travel * 0.5, self.bounds.radius + travel.length() * 0.5);
-        let head_from_world = Affine3A::from_rotation_translation(
-            frame.head.rotation,
-            character.head_pivot + travel - frame.head.rotation * character.head_pivot,
-        )
-        .inverse();
+        let head_from_world = character.head_motion(&frame.head).inverse();
         let mouth = Mouth::new(character, frame);
         let lids = [Side::Left, Side::Right].map(|side| Lids::new(character, frame, side));
         let shown = |k: usize| match settings.view {

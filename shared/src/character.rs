@@ -6,6 +6,7 @@
 mod checked;
 mod colour;
 mod glb;
+mod motion;
 pub mod schema;
 mod zones;
 

@@ -1,7 +1,7 @@
 //! From a drawn frame to one matrix a joint.
 
 use crate::renderer::RenderFrame;
-use glam::{Affine3A, Quat, Vec3};
+use glam::Affine3A;
 use rhytid_shared::Character;
 use rhytid_shared::limits::{MAX_BONES, MAX_JOINTS};
 
@@ -38,44 +38,23 @@ impl Palette {
     /// # Panics
     /// Where `frame` does not fit `character` ([`RenderFrame::fits`]).
     pub fn model_from_rest(&self, character: &Character, frame: &RenderFrame) -> Vec<Affine3A> {
-        let head = model_from_head(character, frame);
+        let head = character.head_motion(&frame.head);
         let of_motion = |motion: &JointMotion| match *motion {
             JointMotion::Still => Affine3A::IDENTITY,
             JointMotion::Head => head,
-            JointMotion::Bone { bone, follows_head: true } => head * head_from_rest(character, frame, bone),
-            JointMotion::Bone { bone, follows_head: false } => head_from_rest(character, frame, bone),
+            JointMotion::Bone { bone, follows_head: true } => head * character.bone_motion(&frame.rotations, &frame.points, bone),
+            JointMotion::Bone { bone, follows_head: false } => character.bone_motion(&frame.rotations, &frame.points, bone),
         };
         self.motions.iter().map(of_motion).collect()
     }
 
     /// As [`Self::model_from_rest`], with all bones at rest on a head that moves: for a face that its shapes deform.
     pub fn model_from_unposed(&self, character: &Character, frame: &RenderFrame) -> Vec<Affine3A> {
-        let head = model_from_head(character, frame);
+        let head = character.head_motion(&frame.head);
         let of_motion = |motion: &JointMotion| match *motion {
             JointMotion::Still | JointMotion::Bone { follows_head: false, .. } => Affine3A::IDENTITY,
             JointMotion::Head | JointMotion::Bone { follows_head: true, .. } => head,
         };
         self.motions.iter().map(of_motion).collect()
     }
-}
-
-/// The rigid motion of the head: about its pivot, then to its place.
-fn model_from_head(character: &Character, frame: &RenderFrame) -> Affine3A {
-    about(frame.head.rotation, character.head_pivot, character.head_pivot + frame.head.position)
-}
-
-/// The motion of one bone in head space. Bones that turn do so about their pivot; all others carry their evaluated
-/// point to its place and turn about it: by the rotation of the bone they turn with, or their own.
-fn head_from_rest(character: &Character, frame: &RenderFrame, bone: usize) -> Affine3A {
-    let description = &character.bones[bone];
-    if let Some(pivot) = description.pivot() {
-        return about(frame.rotations[bone], pivot, pivot);
-    }
-    let rotation = frame.rotations[description.turns_with.unwrap_or(bone)];
-    about(rotation, description.rest, frame.points[bone])
-}
-
-/// Turns about `from` and moves `from` to `to`.
-fn about(rotation: Quat, from: Vec3, to: Vec3) -> Affine3A {
-    Affine3A::from_rotation_translation(rotation, to - rotation * from)
 }

@@ -3,7 +3,7 @@
 use super::faces::{Faces, Moment};
 use super::reader::ReadError;
 use crate::trackers::livelink;
-use glam::{Affine3A, Mat4, Quat, Vec3};
+use glam::{Affine3A, Mat4, Quat};
 use rhytid_shared::{ARKIT_NAMES, ArkitShape, Character, FaceFrame};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -293,12 +293,11 @@ impl Rig {
 
     /// Adds a key of `frame` to every track.
     fn pose(&self, character: &Character, frame: &FaceFrame, tracks: &mut [Track]) {
-        let pivot = character.head_pivot;
-        let head = about(frame.head.rotation, pivot, pivot + frame.head.position);
+        let head = character.head_motion(&frame.head);
         let mut motions: Vec<Affine3A> = Vec::with_capacity(self.moved.len());
         for (moved, track) in self.moved.iter().zip(tracks) {
             let carried = if moved.follows_head { head } else { Affine3A::IDENTITY };
-            let motion = moved.bone.map_or(carried, |bone| carried * bone_motion(character, frame, bone));
+            let motion = moved.bone.map_or(carried, |bone| carried * character.bone_motion(&frame.rotations, &frame.points, bone));
             // What the parent does comes from the nearest joint above that moves.
             let parent = moved.above.map_or(Affine3A::IDENTITY, |above| motions[above]) * moved.parent_rest;
             let local = parent.inverse() * (motion * moved.rest);
@@ -326,19 +325,4 @@ fn target_names(mesh: &gltf::Mesh<'_>) -> Option<Vec<Option<usize>>> {
         ARKIT_NAMES.iter().position(|known| known.eq_ignore_ascii_case(name) || known.eq_ignore_ascii_case(whole))
     };
     Some(extras["targetNames"].as_array()?.iter().map(shape_of).collect())
-}
-
-/// The motion of a bone in head space: as the client draws it.
-fn bone_motion(character: &Character, frame: &FaceFrame, bone: usize) -> Affine3A {
-    let description = &character.bones[bone];
-    if let Some(pivot) = description.pivot() {
-        return about(frame.rotations[bone], pivot, pivot);
-    }
-    let rotation = frame.rotations[description.turns_with.unwrap_or(bone)];
-    about(rotation, description.rest, frame.points[bone])
-}
-
-/// Turns about `from` and moves `from` to `to`.
-fn about(rotation: Quat, from: Vec3, to: Vec3) -> Affine3A {
-    Affine3A::from_rotation_translation(rotation, to - rotation * from)
 }
