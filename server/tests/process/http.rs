@@ -9,7 +9,7 @@ use std::net::TcpStream;
 /// Whatever keeps an answer from coming in time, or one that is not HTTP.
 pub fn ask(address: &str, method: &str, path: &str, headers: &[&str], body: &str) -> Result<(u16, String)> {
     let mut stream = TcpStream::connect(address)?;
-    stream.set_read_timeout(Some(crate::process::PATIENCE))?;
+    stream.set_read_timeout(Some(super::process::PATIENCE))?;
     let headers: String = headers.iter().map(|header| format!("{header}\r\n")).collect();
     let length = body.len();
     write!(stream, "{method} {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\nContent-Length: {length}\r\n{headers}\r\n{body}")?;
