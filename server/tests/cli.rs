@@ -4,72 +4,42 @@
 
 mod clip_fixture;
 
+#[cfg(unix)]
+#[path = "process/http.rs"]
+mod http;
+#[cfg(target_os = "linux")]
+#[path = "process/memory.rs"]
+mod memory;
+mod process;
+#[cfg(unix)]
+#[path = "process/signal.rs"]
+mod signal;
+#[path = "process/socket.rs"]
+mod socket;
+
+#[cfg(unix)]
+use process::Process;
+use process::{PATIENCE, Server, program};
 use rhytid_shared::view::ViewMessage;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::path::PathBuf;
-use std::process::{Child, ChildStdout, Command, Output, Stdio};
+use std::process::{Output, Stdio};
 use std::time::{Duration, Instant};
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
-use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
+use tokio_tungstenite::tungstenite::{Message, WebSocket};
 
-const PROGRAM: &str = env!("CARGO_BIN_EXE_rhytid-server");
-
-/// A server process that ends with the test.
-struct Served {
-    child: Child,
-    address: String,
-    stdout: BufReader<ChildStdout>,
+fn serve(args: &[&str]) -> Server {
+    Server::start(&[&["serve"], args].concat())
 }
 
-impl Served {
-    fn start(args: &[&str]) -> Self {
-        let mut child = Command::new(PROGRAM)
-            .args(["serve", "--listen", "127.0.0.1:0"])
-            .args(args)
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .expect("the program starts");
-        let mut stdout = BufReader::new(child.stdout.take().expect("piped"));
-        let mut line = String::new();
-        stdout.read_line(&mut line).expect("it prints a line");
-        let address = line.trim().strip_prefix("listening on http://").expect("its first line says where it listens").to_owned();
-        Self { child, address, stdout }
-    }
-
-    /// A viewer's socket; `room` may have a query behind it.
-    fn view(&self, room: &str) -> WebSocket<TcpStream> {
-        let (name, query) = room.split_at(room.find('?').unwrap_or(room.len()));
-        let stream = TcpStream::connect(&self.address).expect("it listens");
-        stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
-        tungstenite::client(format!("ws://{}/v1/rooms/{name}/view{query}", self.address), stream).expect("it upgrades").0
-    }
-
-    #[cfg(unix)]
-    fn signal(&self, signal: rustix::process::Signal) {
-        let pid = rustix::process::Pid::from_raw(self.child.id() as i32).expect("not 0");
-        rustix::process::kill_process(pid, signal).expect("it still runs");
-    }
-
-    #[cfg(target_os = "linux")]
-    fn resident_kib(&self) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("it still runs");
-        let line = status.lines().find(|line| line.starts_with("VmRSS:")).expect("Linux says so");
-        line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number of KiB")
-    }
-}
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        // It may have ended by itself.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// A viewer's socket; `query` may be empty.
+fn view(server: &Server, query: &str) -> WebSocket<TcpStream> {
+    socket::open(&server.address, &format!("demo/view{query}"), &[], PATIENCE).expect("it upgrades")
 }
 
 fn run(args: &[&str]) -> Output {
-    Command::new(PROGRAM).args(args).output().expect("the program starts")
+    program(args).output().expect("the program starts")
 }
 
 /// Runs a command that must fail with one line on standard error.
@@ -91,13 +61,13 @@ fn scratch(name: &str, content: &[u8]) -> PathBuf {
 #[cfg(unix)]
 #[test]
 fn both_signals_end_it_cleanly_and_sockets_are_told() {
-    use rustix::process::Signal;
-    for signal in [Signal::INT, Signal::TERM] {
-        let mut served = Served::start(&[]);
-        let mut viewer = served.view("demo");
+    use signal::{Signal, signal};
+    for kind in [Signal::INT, Signal::TERM] {
+        let mut served = serve(&[]);
+        let mut viewer = view(&served, "");
         assert!(matches!(viewer.read(), Ok(Message::Ping(_))));
         assert!(matches!(viewer.read(), Ok(Message::Text(_))));
-        served.signal(signal);
+        signal(&served.process, kind);
         let close = loop {
             match viewer.read().expect("a close frame comes") {
                 Message::Close(frame) => break frame.expect("with a reason"),
@@ -107,16 +77,14 @@ fn both_signals_end_it_cleanly_and_sockets_are_told() {
         assert_eq!((close.code, close.reason.as_str()), (CloseCode::Away, "server is shutting down"));
         // Answers the close.
         while viewer.read().is_ok() {}
-        assert_eq!(served.child.wait().unwrap().code(), Some(0), "{signal:?}");
-        let mut rest = String::new();
-        served.stdout.read_to_string(&mut rest).unwrap();
-        assert_eq!(rest, "", "standard output has one line");
+        assert_eq!(served.process.wait().unwrap().code(), Some(0), "{kind:?}");
+        // That it has printed one line is looked at when it is dropped, as with every server.
     }
 }
 
 #[test]
 fn what_cannot_work_says_so_in_one_line() {
-    let served = Served::start(&[]);
+    let served = serve(&[]);
     let error = failure(&["serve", "--listen", &served.address]);
     assert!(error.contains(&served.address) && error.contains("in use"), "{error}");
     assert!(failure(&["serve", "--character", "no/such.glb"]).contains("no/such.glb"));
@@ -149,9 +117,9 @@ fn what_cannot_work_says_so_in_one_line() {
 #[test]
 fn flags_win_over_the_file_and_send_reports() {
     let config = scratch("good.toml", b"listen = \"256.1.1.1:1\"\n[limits]\nrooms = 1\nviewers_per_room = 2\n");
-    let served = Served::start(&["--config", config.to_str().unwrap(), "--max-viewers", "1"]);
-    let _first = served.view("demo");
-    let mut second = served.view("demo");
+    let served = serve(&["--config", config.to_str().unwrap(), "--max-viewers", "1"]);
+    let _first = view(&served, "");
+    let mut second = view(&served, "");
     let refused = second.read().unwrap();
     assert!(refused.to_text().unwrap().contains("the room has 1 viewers already"), "{refused}");
     let feed = scratch("three.jsonl", b"{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n{\"type\":\"frame\",\"t\":9,\"weights\":{}}\n{\"type\":\"calibrate\"}\n");
@@ -162,7 +130,7 @@ fn flags_win_over_the_file_and_send_reports() {
 
 #[test]
 fn refused_frames_make_send_fail_and_say_how_many() {
-    let served = Served::start(&[]);
+    let served = serve(&[]);
     let feed = scratch(
         "refused.jsonl",
         b"{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n{\"type\":\"frame\",\"t\":1,\"bones\":{\"tail\":[0,0,0]}}\n",
@@ -178,14 +146,10 @@ fn a_clip_of_the_character_moves_the_viewers_bones() {
     let (glb, _) = clip_fixture::with_clip();
     let character = scratch("clip.glb", &glb);
     let character = character.to_str().unwrap();
-    let served = Served::start(&["--character", character]);
-    let mut viewer = served.view("demo?format=json");
+    let served = serve(&["--character", character]);
+    let mut viewer = view(&served, "?format=json");
     let to = format!("ws://{}", served.address);
-    let sender = Command::new(PROGRAM)
-        .args(["send", "--clip", "nod", "--character", character, "--to", &to])
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
+    let sender = program(&["send", "--clip", "nod", "--character", character, "--to", &to]).stderr(Stdio::piped()).spawn().unwrap();
     let mut rest = Vec::new();
     let last = loop {
         let message = viewer.read().expect("frames come");
@@ -214,51 +178,30 @@ fn a_clip_of_the_character_moves_the_viewers_bones() {
 #[cfg(unix)]
 #[test]
 fn a_sender_that_is_interrupted_closes_its_session() {
-    let served = Served::start(&[]);
+    let served = serve(&[]);
     let feed = scratch(
         "slow.jsonl",
         b"{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n{\"type\":\"frame\",\"t\":9000,\"weights\":{}}\n",
     );
-    let mut viewer = served.view("demo");
-    let mut sender = Command::new(PROGRAM)
-        .args(["send", feed.to_str().unwrap(), "--to", &format!("ws://{}", served.address)])
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
+    let mut viewer = view(&served, "");
+    let to = format!("ws://{}", served.address);
+    let mut sender = Process::start(program(&["send", feed.to_str().unwrap(), "--to", &to]).stderr(Stdio::null()));
     // Its first frame has come: the next one is due in hours.
     while !matches!(viewer.read().unwrap(), Message::Binary(_)) {}
-    let pid = rustix::process::Pid::from_raw(sender.id() as i32).expect("not 0");
-    rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
+    signal::signal(&sender, signal::Signal::INT);
     assert_eq!(sender.wait().unwrap().code(), Some(0));
-    let mut stream = TcpStream::connect(&served.address).unwrap();
-    std::io::Write::write_all(&mut stream, format!("GET /metrics HTTP/1.0\r\nHost: {}\r\n\r\n", served.address).as_bytes()).unwrap();
-    let mut text = String::new();
-    stream.read_to_string(&mut text).unwrap();
+    let (_, text) = http::ask(&served.address, "GET", "/metrics", &[], "").unwrap();
     assert!(text.contains("rhytid_sessions_ended_total{reason=\"closed\"} 1\n"), "{text}");
 }
 
 #[test]
 fn more_is_logged_with_verbose() {
     let log = |args: &[&str]| {
-        let mut child = Command::new(PROGRAM)
-            .args(["serve", "--listen", "127.0.0.1:0"])
-            .args(args)
-            .env_remove("RUST_LOG")
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let address = line.trim().strip_prefix("listening on http://").unwrap();
-        let stream = TcpStream::connect(address).unwrap();
-        let (mut viewer, _) = tungstenite::client(format!("ws://{address}/v1/rooms/demo/view"), stream).unwrap();
+        let mut served = serve(args);
+        let mut viewer = view(&served, "");
         while !matches!(viewer.read().unwrap(), Message::Text(_)) {}
-        child.kill().unwrap();
-        let mut log = String::new();
-        child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
-        child.wait().unwrap();
-        log
+        served.kill();
+        served.log()
     };
     let (plain, verbose) = (log(&[]), log(&["-v"]));
     assert!(plain.contains("serving") && !plain.contains("viewer connects"), "{plain}");
@@ -270,13 +213,11 @@ fn more_is_logged_with_verbose() {
 fn a_closed_standard_output_is_no_end() {
     // Writing to this device always fails.
     let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
-    let mut child = Command::new(PROGRAM).args(["serve", "--listen", "127.0.0.1:0"]).stdout(full).stderr(Stdio::piped()).spawn().unwrap();
+    let mut child = Process::start(program(&["serve", "--listen", "127.0.0.1:0"]).stdout(full).stderr(Stdio::piped()));
     let mut log = BufReader::new(child.stderr.take().unwrap()).lines();
     let said = log.by_ref().map(|line| line.unwrap()).find(|line| line.contains("cannot write to standard output"));
     assert!(said.is_some(), "it says so");
     assert!(log.any(|line| line.unwrap().contains("serving")), "and serves");
-    child.kill().unwrap();
-    child.wait().unwrap();
 }
 
 /// Bytes of the server's memory that each of many viewers takes, once all have got frames.
@@ -288,11 +229,11 @@ fn memory_of_viewers(query: &str) -> f64 {
     setrlimit(Resource::Nofile, limit).unwrap();
     let most = limit.maximum.map_or(2000, |maximum| (maximum.saturating_sub(200)).min(2000)) as usize;
 
-    let served = Served::start(&[]);
+    let served = serve(&[]);
     let connect = |count: usize| -> Vec<WebSocket<TcpStream>> {
         (0..count)
             .map(|_| {
-                let mut viewer = served.view(&format!("demo{query}"));
+                let mut viewer = view(&served, query);
                 while !matches!(viewer.read().unwrap(), Message::Text(_)) {}
                 viewer.flush().unwrap();
                 viewer
@@ -301,11 +242,10 @@ fn memory_of_viewers(query: &str) -> f64 {
     };
     // The first ones pay for what all share.
     let _first = connect(20);
-    let before = served.resident_kib();
+    let before = memory::resident(&served.process);
     let mut viewers = connect(most);
     // A few frames, so that every buffer has been used.
-    let stream = TcpStream::connect(&served.address).unwrap();
-    let (mut publisher, _) = tungstenite::client(format!("ws://{}/v1/rooms/demo/publish", served.address), stream).unwrap();
+    let mut publisher = socket::open(&served.address, "demo/publish", &[], PATIENCE).unwrap();
     publisher.send(Message::text(r#"{"type":"hello","version":1}"#)).unwrap();
     publisher.read().unwrap();
     let start = Instant::now();
@@ -322,7 +262,7 @@ fn memory_of_viewers(query: &str) -> f64 {
     for viewer in &mut viewers {
         while !matches!(viewer.read().unwrap(), Message::Binary(_) | Message::Text(_)) {}
     }
-    let bytes = served.resident_kib().saturating_sub(before) as f64 * 1024.0 / most as f64;
+    let bytes = memory::resident(&served.process).saturating_sub(before) as f64 / most as f64;
     println!("{most} viewers{query}: {bytes:.0} bytes of memory each");
     bytes
 }

@@ -9,56 +9,26 @@
 // Memory is read as Linux tells it.
 #![cfg(target_os = "linux")]
 
-use rhytid_shared::packet::{Decoder, PacketLayout};
-use rhytid_shared::view::ViewMessage;
-use std::io::{BufRead, BufReader, Read};
+#[path = "process/memory.rs"]
+mod memory;
+mod process;
+#[path = "process/socket.rs"]
+mod socket;
+#[path = "process/viewer.rs"]
+mod viewer;
+
+use process::Server;
 use std::net::TcpStream;
-use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
+use viewer::{Sight, Viewer};
 
 const ROOMS: u32 = 3;
 const VIEWERS: u32 = 24;
 const FPS: f64 = 60.0;
 /// What the memory may grow by after the first minute of half an hour.
 const MOST_GROWTH: f64 = 0.02;
-
-/// A server process that ends with the test.
-struct Served {
-    child: Child,
-    port: u16,
-}
-
-impl Served {
-    fn start() -> Self {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_rhytid-server"))
-            .args(["serve", "--listen", "127.0.0.1:0", "--publisher-timeout", "3", "--viewer-timeout", "6", "--write-timeout", "6"])
-            .args(["--ping-interval", "1", "--room-timeout", "2"])
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let port = line.trim().rsplit_once(':').expect("its first line says where it listens").1.parse().unwrap();
-        Self { child, port }
-    }
-
-    /// Resident memory, bytes.
-    fn memory(&self) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("the server lives");
-        let kib: u64 = status.lines().find_map(|line| line.strip_prefix("VmRSS:")?.trim().strip_suffix(" kB")?.parse().ok()).unwrap();
-        kib << 10
-    }
-}
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
 
 /// The same numbers in every run: splitmix64.
 struct Random(u64);
@@ -87,29 +57,18 @@ fn count(counter: &AtomicU64) {
     counter.fetch_add(1, Ordering::Relaxed);
 }
 
-fn open(port: u16, path: &str) -> tungstenite::Result<WebSocket<TcpStream>> {
-    let stream = TcpStream::connect(("127.0.0.1", port))?;
-    stream.set_read_timeout(Some(Duration::from_millis(200)))?;
-    stream.set_nodelay(true)?;
-    tungstenite::client(format!("ws://127.0.0.1:{port}/v1/rooms/{path}"), stream).map(|(socket, _)| socket).map_err(|error| match error {
-        tungstenite::HandshakeError::Failure(error) => error,
-        tungstenite::HandshakeError::Interrupted(_) => tungstenite::Error::Io(std::io::ErrorKind::TimedOut.into()),
-    })
-}
-
-/// Nothing came within the time-out of a read.
-fn is_pause(error: &tungstenite::Error) -> bool {
-    matches!(error, tungstenite::Error::Io(error) if matches!(error.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut))
+fn open(address: &str, path: &str) -> tungstenite::Result<WebSocket<TcpStream>> {
+    socket::open(address, path, &[], Duration::from_millis(200))
 }
 
 /// Publishes to a room, session after session. Each ends by a close, by silence, or by the next one's takeover.
-fn publish(port: u16, room: u32, seed: u64, seen: &Seen, is_over: &AtomicBool) {
+fn publish(address: &str, room: u32, seed: u64, seen: &Seen, is_over: &AtomicBool) {
     let mut random = Random(seed);
     // What nobody reads or writes any more: the server's own time-outs end it.
     let mut silent: Vec<(Instant, WebSocket<TcpStream>)> = Vec::new();
     while !is_over.load(Ordering::Relaxed) {
         silent.retain(|(since, _)| since.elapsed() < Duration::from_secs(8));
-        let Ok(mut socket) = open(port, &format!("soak-{room}/publish")) else { continue };
+        let Ok(mut socket) = open(address, &format!("soak-{room}/publish")) else { continue };
         let hello = r#"{"type":"hello","version":1,"source":"soak","fps":60,"takeover":true,"keep_neutral":true}"#;
         if socket.send(Message::text(hello)).is_err() {
             continue;
@@ -142,35 +101,30 @@ fn publish(port: u16, room: u32, seed: u64, seen: &Seen, is_over: &AtomicBool) {
 }
 
 /// Watches rooms, one after the other, for a while each; some stop reading. Checks the order of what comes.
-fn watch(port: u16, seed: u64, seen: &Seen, is_over: &AtomicBool) {
+fn watch(address: &str, seed: u64, seen: &Seen, is_over: &AtomicBool) {
     let mut random = Random(seed);
     while !is_over.load(Ordering::Relaxed) {
         let room = random.below(u64::from(ROOMS));
-        let Ok(mut socket) = open(port, &format!("soak-{room}/view")) else { continue };
+        let Ok(mut viewer) = open(address, &format!("soak-{room}/view")).map(Viewer::new) else { continue };
         count(&seen.joins);
         let until = Instant::now() + Duration::from_millis(200 + random.below(6000));
         let stops_reading = random.below(8) == 0;
-        let (mut decoder, mut last) = (None, None);
+        let mut last = None;
         while Instant::now() < until && !is_over.load(Ordering::Relaxed) {
-            match socket.read() {
-                Ok(Message::Text(text)) => {
-                    let ViewMessage::Hello(hello) = serde_json::from_str(&text).unwrap() else { break };
-                    decoder = Some(Decoder::new(PacketLayout::try_from(&hello.character).unwrap()));
-                }
-                Ok(Message::Binary(packet)) => {
-                    let decoder = decoder.as_mut().expect("the hello comes first");
-                    let mut frame = decoder.layout().frame_at_rest();
-                    decoder.decode(&packet, &mut frame).expect("what a viewer gets can be decoded");
+            match viewer.look() {
+                Sight::Face(frame) => {
                     let now = (frame.session, frame.seq);
                     // A key that goes before its delta again is the frame that a delta is read with.
                     assert!(last.is_none_or(|last| last <= now), "{now:?} after {last:?}");
                     last = Some(now);
                     count(&seen.frames);
                 }
-                Ok(Message::Close(_)) => break,
-                Ok(_) => {}
-                Err(error) if is_pause(&error) => {}
-                Err(_) => break,
+                Sight::Nothing => {}
+                Sight::Refused(error) => {
+                    println!("a viewer is sent away: {error}");
+                    break;
+                }
+                Sight::Gone => break,
             }
             if stops_reading && last.is_some() {
                 std::thread::sleep(until.saturating_duration_since(Instant::now()));
@@ -178,31 +132,32 @@ fn watch(port: u16, seed: u64, seen: &Seen, is_over: &AtomicBool) {
         }
         // Half of them leave without a word.
         if random.below(2) == 0 {
-            let _ = socket.close(None);
-            let _ = socket.flush();
+            let _ = viewer.socket.close(None);
+            let _ = viewer.socket.flush();
         }
     }
 }
 
 /// Runs for `time`; the memory at each tenth of it, bytes.
 fn soak(time: Duration) -> Vec<u64> {
-    let mut server = Served::start();
-    let mut stderr = server.child.stderr.take().unwrap();
+    let mut server = Server::start(
+        &[
+            &["serve", "--publisher-timeout", "3", "--viewer-timeout", "6", "--write-timeout", "6"][..],
+            &["--ping-interval", "1", "--room-timeout", "2"],
+        ]
+        .concat(),
+    );
     let (seen, is_over) = (Seen::default(), AtomicBool::new(false));
     let mut memory = Vec::new();
-    let said = std::thread::scope(|scope| {
-        let reader = scope.spawn(move || {
-            let mut said = String::new();
-            let _ = stderr.read_to_string(&mut said);
-            said
-        });
-        let (seen, is_over, port) = (&seen, &is_over, server.port);
-        let mut peers: Vec<_> = (0..ROOMS).map(|room| scope.spawn(move || publish(port, room, u64::from(room), seen, is_over))).collect();
-        peers.extend((0..VIEWERS).map(|k| scope.spawn(move || watch(port, 1000 + u64::from(k), seen, is_over))));
+    std::thread::scope(|scope| {
+        let (seen, is_over, address) = (&seen, &is_over, server.address.as_str());
+        let mut peers: Vec<_> =
+            (0..ROOMS).map(|room| scope.spawn(move || publish(address, room, u64::from(room), seen, is_over))).collect();
+        peers.extend((0..VIEWERS).map(|k| scope.spawn(move || watch(address, 1000 + u64::from(k), seen, is_over))));
         let (start, mut is_broken) = (Instant::now(), false);
         while start.elapsed() < time && !is_broken {
             std::thread::sleep(time / 30);
-            memory.push(server.memory());
+            memory.push(memory::resident(&server.process));
             is_broken = peers.iter().any(std::thread::ScopedJoinHandle::is_finished);
             let of = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
             println!(
@@ -219,9 +174,9 @@ fn soak(time: Duration) -> Vec<u64> {
         is_over.store(true, Ordering::Relaxed);
         // Whoever has seen something wrong has panicked; that is passed on by the scope.
         peers.into_iter().for_each(|peer| peer.join().expect("nobody saw anything wrong"));
-        let _ = server.child.kill();
-        reader.join().unwrap()
     });
+    server.kill();
+    let said = server.log();
     assert!(!said.contains("panicked"), "{said}");
     assert!(seen.frames.into_inner() > 1000 && seen.joins.into_inner() > u64::from(VIEWERS));
     memory

@@ -2,93 +2,72 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
 
+#[path = "process/http.rs"]
+mod http;
+mod process;
+#[path = "process/socket.rs"]
+mod socket;
+
+use process::{PATIENCE, Server, program};
 use rhytid_server::{Role, make_key_file, make_token};
-use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
-use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::path::Path;
 use std::time::{Duration, Instant};
-use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-use tokio_tungstenite::tungstenite::{self, HandshakeError, Message, WebSocket};
+use tempfile::TempDir;
+use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
 
-const PROGRAM: &str = env!("CARGO_BIN_EXE_rhytid-server");
+/// A folder that goes with the test, and a new key in it.
+struct Folder(TempDir);
 
-struct Scratch(PathBuf);
-
-impl Scratch {
-    fn new(name: &str) -> Self {
-        let path = std::env::temp_dir().join(format!("rhytid-tokens-{}-{name}", std::process::id()));
-        let _ = std::fs::remove_file(&path);
-        Self(path)
+impl Folder {
+    fn with_key() -> Self {
+        let folder = Self(tempfile::tempdir().unwrap());
+        make_key_file(Path::new(&folder.key())).unwrap();
+        folder
     }
 
-    fn shown(&self) -> &str {
-        self.0.to_str().unwrap()
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_file(&self.0);
-    }
-}
-
-/// A server process that ends with the test.
-struct Served {
-    child: Child,
-    port: u16,
-}
-
-impl Served {
-    fn start(args: &[&str]) -> Self {
-        let mut child = Command::new(PROGRAM).arg("serve").args(args).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let port = line.trim().rsplit_once(':').expect("its first line says where it listens").1.parse().unwrap();
-        Self { child, port }
+    fn path(&self, name: &str) -> String {
+        self.0.path().join(name).to_str().unwrap().to_owned()
     }
 
-    /// Status and body of a GET.
-    fn get(&self, path: &str, token: Option<&str>) -> (u16, String) {
-        self.ask("GET", path, token, "")
+    fn key(&self) -> String {
+        self.path("key")
     }
 
-    /// Status and body of any request.
-    fn ask(&self, method: &str, path: &str, token: Option<&str>, body: &str) -> (u16, String) {
-        let mut stream = TcpStream::connect(("127.0.0.1", self.port)).unwrap();
-        let token = token.map(|token| format!("Authorization: Bearer {token}\r\n")).unwrap_or_default();
-        let length = body.len();
-        write!(stream, "{method} {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: {length}\r\n{token}\r\n{body}")
-            .unwrap();
-        let mut text = String::new();
-        stream.read_to_string(&mut text).unwrap();
-        (text[9..12].parse().unwrap(), text.split_once("\r\n\r\n").unwrap().1.to_owned())
-    }
-
-    /// A socket, or the code of the error that refused it.
-    fn open(&self, path: &str, headers: &[(&'static str, String)]) -> Result<WebSocket<TcpStream>, String> {
-        let stream = TcpStream::connect(("127.0.0.1", self.port)).unwrap();
-        stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
-        let mut request = format!("ws://localhost:{}/v1/rooms/{path}", self.port).into_client_request().unwrap();
-        for (name, value) in headers {
-            request.headers_mut().insert(*name, value.parse().unwrap());
-        }
-        match tungstenite::client(request, stream) {
-            Ok((socket, _)) => Ok(socket),
-            Err(HandshakeError::Failure(tungstenite::Error::Http(answer))) => {
-                let error: serde_json::Value = serde_json::from_slice(answer.body().as_ref().unwrap()).unwrap();
-                Err(error["code"].as_str().unwrap().to_owned())
-            }
-            Err(error) => panic!("{error}"),
-        }
+    /// A token of its key.
+    fn token(&self, role: Role, room: &str, time: Duration) -> String {
+        make_token(Path::new(&self.key()), role, &[room.to_owned()], time).unwrap()
     }
 }
 
-impl Drop for Served {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// A server that wants tokens.
+fn serve(key: &str, args: &[&str]) -> Server {
+    Server::start(&[&["serve", "--token-key", key], args].concat())
+}
+
+/// Its address, by name.
+fn url(server: &Server) -> String {
+    server.address.replace("127.0.0.1", "ws://localhost")
+}
+
+/// Status and body of a GET.
+fn get(server: &Server, path: &str, token: Option<&str>) -> (u16, String) {
+    ask(server, "GET", path, token, "")
+}
+
+/// Status and body of any request.
+fn ask(server: &Server, method: &str, path: &str, token: Option<&str>, body: &str) -> (u16, String) {
+    let token = token.map(|token| format!("Authorization: Bearer {token}"));
+    http::ask(&server.address, method, path, &token.as_deref().into_iter().collect::<Vec<_>>(), body).unwrap()
+}
+
+/// A socket, or the code of the error that refused it.
+fn open(server: &Server, path: &str, headers: &[(&'static str, String)]) -> Result<WebSocket<TcpStream>, String> {
+    socket::open(&server.address, path, headers, PATIENCE).map_err(|error| {
+        let tungstenite::Error::Http(answer) = error else { panic!("{error}") };
+        let error: serde_json::Value = serde_json::from_slice(answer.body().as_ref().unwrap()).unwrap();
+        error["code"].as_str().unwrap().to_owned()
+    })
 }
 
 fn header(token: &str) -> [(&'static str, String); 1] {
@@ -97,12 +76,11 @@ fn header(token: &str) -> [(&'static str, String); 1] {
 
 #[test]
 fn sockets_and_pages_open_to_the_right_token_only() {
-    let key = Scratch::new("right");
-    make_key_file(&key.0).unwrap();
-    let make = |role, room: &str| make_token(&key.0, role, &[room.to_owned()], Duration::from_secs(60)).unwrap();
+    let folder = Folder::with_key();
+    let make = |role, room: &str| folder.token(role, room, Duration::from_secs(60));
     let (view, publish, admin) = (make(Role::View, "demo"), make(Role::Publish, "demo"), make(Role::Admin, "*"));
-    let server = Served::start(&["--listen", "127.0.0.1:0", "--token-key", key.shown()]);
-    let refused = |path: &str, headers: &[(&'static str, String)]| server.open(path, headers).err();
+    let server = serve(&folder.key(), &[]);
+    let refused = |path: &str, headers: &[(&'static str, String)]| open(&server, path, headers).err();
 
     assert_eq!(refused("demo/view", &[]).as_deref(), Some("token_missing"));
     assert_eq!(refused("demo/view", &header("a.b.c")).as_deref(), Some("token_bad"));
@@ -123,12 +101,12 @@ fn sockets_and_pages_open_to_the_right_token_only() {
     assert_eq!(refused("demo/publish", &offer(&view)).as_deref(), Some("token_role"));
     assert_eq!(refused(&format!("demo/view?token={view}"), &[]).as_deref(), Some("token_missing"));
 
-    assert_eq!(server.get("/healthz", None).0, 200);
-    assert_eq!(server.get("/", None).0, 200);
+    assert_eq!(get(&server, "/healthz", None).0, 200);
+    assert_eq!(get(&server, "/", None).0, 200);
     for path in ["/metrics", "/api/rooms", "/api/trackers", "/api/profiles"] {
-        assert_eq!(server.get(path, None).0, 401, "{path}");
-        assert_eq!(server.get(path, Some(&publish)).0, 403, "{path}");
-        assert_eq!(server.get(path, Some(&admin)).0, 200, "{path}");
+        assert_eq!(get(&server, path, None).0, 401, "{path}");
+        assert_eq!(get(&server, path, Some(&publish)).0, 403, "{path}");
+        assert_eq!(get(&server, path, Some(&admin)).0, 200, "{path}");
     }
     // Who watches a room sees who drives its face, and who publishes to it the profiles to choose from.
     for (path, token, status) in [
@@ -137,12 +115,12 @@ fn sockets_and_pages_open_to_the_right_token_only() {
         ("/api/profiles?room=demo", &publish, 200),
         ("/api/rooms?room=a%20b", &admin, 400),
     ] {
-        assert_eq!(server.get(path, Some(token)).0, status, "{path}");
+        assert_eq!(get(&server, path, Some(token)).0, status, "{path}");
     }
-    let (_, metrics) = server.get("/metrics", Some(&admin));
+    let (_, metrics) = get(&server, "/metrics", Some(&admin));
     assert!(metrics.contains("reason=\"token_role\"} 7"), "three sockets and four pages: {metrics}");
-    assert_eq!(server.get("/api/rooms?room=other", Some(&view)).0, 403);
-    assert_eq!(server.get("/api/profiles?room=demo", Some(&view)).0, 403);
+    assert_eq!(get(&server, "/api/rooms?room=other", Some(&view)).0, 403);
+    assert_eq!(get(&server, "/api/profiles?room=demo", Some(&view)).0, 403);
     // A page asks why it is not let in.
     for (query, token, status, said) in [
         ("role=view&room=demo", None, 401, "token_missing"),
@@ -152,7 +130,7 @@ fn sockets_and_pages_open_to_the_right_token_only() {
         ("role=king&room=demo", Some(&admin), 400, "unknown_role"),
         ("role=view&room=a%20b", Some(&admin), 400, "bad_room_name"),
     ] {
-        let (got, body) = server.get(&format!("/api/access?{query}"), token.map(String::as_str));
+        let (got, body) = get(&server, &format!("/api/access?{query}"), token.map(String::as_str));
         assert!(got == status && body.contains(said), "{query}: {got} {body}");
     }
 }
@@ -160,14 +138,13 @@ fn sockets_and_pages_open_to_the_right_token_only() {
 /// A room's face is in its recordings: they open to no more tokens than the room does.
 #[test]
 fn recordings_open_to_the_right_token_only() {
-    let (key, folder) = (Scratch::new("takes-key"), std::env::temp_dir().join(format!("rhytid-tokens-takes-{}", std::process::id())));
-    std::fs::create_dir_all(&folder).unwrap();
-    make_key_file(&key.0).unwrap();
-    let make = |role, room: &str| make_token(&key.0, role, &[room.to_owned()], Duration::from_secs(60)).unwrap();
+    let folder = Folder::with_key();
+    let make = |role, room: &str| folder.token(role, room, Duration::from_secs(60));
     let (view, publish, other) = (make(Role::View, "demo"), make(Role::Publish, "demo"), make(Role::Publish, "other"));
     let admin = make(Role::Admin, "*");
-    let shown = folder.to_str().unwrap();
-    let server = Served::start(&["--listen", "127.0.0.1:0", "--token-key", key.shown(), "--record", shown, "--record-rooms", "none"]);
+    let takes = folder.path("takes");
+    std::fs::create_dir(&takes).unwrap();
+    let server = serve(&folder.key(), &["--record", &takes, "--record-rooms", "none"]);
     let code = |(status, body): (u16, String)| {
         let said: serde_json::Value = serde_json::from_str(&body).unwrap_or_else(|error| panic!("{error}: {body}"));
         (status, said["code"].as_str().unwrap_or_default().to_owned())
@@ -178,11 +155,11 @@ fn recordings_open_to_the_right_token_only() {
     // Who publishes to a room records it.
     for (token, expected) in [(None, &missing), (Some(&view), &role), (Some(&other), &room), (Some(&publish), &ok)] {
         let token = token.map(String::as_str);
-        assert_eq!(code(server.ask("POST", "/api/rooms/demo/record/start", token, "")), *expected, "{token:?}");
+        assert_eq!(code(ask(&server, "POST", "/api/rooms/demo/record/start", token, "")), *expected, "{token:?}");
     }
     for (token, expected) in [(None, &missing), (Some(&view), &role), (Some(&other), &room), (Some(&publish), &ok)] {
         let token = token.map(String::as_str);
-        assert_eq!(code(server.ask("POST", "/api/rooms/demo/record/stop", token, "")), *expected, "{token:?}");
+        assert_eq!(code(ask(&server, "POST", "/api/rooms/demo/record/stop", token, "")), *expected, "{token:?}");
     }
     // Which recordings there are, admins see; those of a room, who publishes to it.
     for (path, token, expected) in [
@@ -194,21 +171,21 @@ fn recordings_open_to_the_right_token_only() {
         ("/api/recordings?room=demo", Some(&other), &room),
         ("/api/recordings?room=demo", Some(&publish), &ok),
     ] {
-        assert_eq!(code(server.get(path, token.map(String::as_str))), *expected, "{path} {token:?}");
+        assert_eq!(code(get(&server, path, token.map(String::as_str))), *expected, "{path} {token:?}");
     }
-    let listed: serde_json::Value = serde_json::from_str(&server.get("/api/recordings?room=demo", Some(&publish)).1).unwrap();
+    let listed: serde_json::Value = serde_json::from_str(&get(&server, "/api/recordings?room=demo", Some(&publish)).1).unwrap();
     let file = listed["recordings"][0]["file"].as_str().unwrap().to_owned();
-    let of_other: serde_json::Value = serde_json::from_str(&server.get("/api/recordings?room=other", Some(&other)).1).unwrap();
+    let of_other: serde_json::Value = serde_json::from_str(&get(&server, "/api/recordings?room=other", Some(&other)).1).unwrap();
     assert!(file.starts_with("demo-") && of_other["recordings"].as_array().unwrap().is_empty(), "{of_other}");
 
     // What is played into a room, whoever watches it may know; who plays must publish there, and may watch what is played.
     for (token, expected) in [(None, &missing), (Some(&other), &room), (Some(&view), &ok)] {
-        assert_eq!(code(server.get("/api/rooms/demo/replay", token.map(String::as_str))), *expected, "{token:?}");
+        assert_eq!(code(get(&server, "/api/rooms/demo/replay", token.map(String::as_str))), *expected, "{token:?}");
     }
-    assert!(server.get("/api/rooms/demo/replay", Some(&view)).1.contains("\"control\":false"));
-    assert!(server.get("/api/rooms/demo/replay", Some(&publish)).1.contains("\"control\":true"));
+    assert!(get(&server, "/api/rooms/demo/replay", Some(&view)).1.contains("\"control\":false"));
+    assert!(get(&server, "/api/rooms/demo/replay", Some(&publish)).1.contains("\"control\":true"));
     let body = serde_json::json!({ "file": file }).to_string();
-    let played = |path: &str, token: Option<&String>| code(server.ask("POST", path, token.map(String::as_str), &body));
+    let played = |path: &str, token: Option<&String>| code(ask(&server, "POST", path, token.map(String::as_str), &body));
     assert_eq!(played("/api/rooms/demo/replay", None), missing);
     assert_eq!(played("/api/rooms/demo/replay", Some(&view)), role);
     assert_eq!(played("/api/rooms/demo/replay", Some(&other)), room);
@@ -217,32 +194,25 @@ fn recordings_open_to_the_right_token_only() {
     assert_eq!(played("/api/rooms/demo/replay", Some(&publish)), ok);
     for (token, expected) in [(None, &missing), (Some(&view), &role), (Some(&other), &room), (Some(&publish), &ok)] {
         let token = token.map(String::as_str);
-        assert_eq!(code(server.ask("DELETE", "/api/rooms/demo/replay", token, "")), *expected, "{token:?}");
+        assert_eq!(code(ask(&server, "DELETE", "/api/rooms/demo/replay", token, "")), *expected, "{token:?}");
     }
     // A program records as a viewer, with a token as every other.
-    let out = folder.join("taken.mcap");
-    let record = |token: &[&str]| {
-        let to = format!("ws://localhost:{}", server.port);
-        let args = ["record", out.to_str().unwrap(), "--seconds", "0.3", "--server", &to];
-        Command::new(PROGRAM).args(args).args(token).env_remove("RHYTID_TOKEN").output().unwrap()
-    };
+    let (out, to) = (folder.path("taken.mcap"), url(&server));
+    let record = |token: &[&str]| program(&["record", &out, "--seconds", "0.3", "--server", &to]).args(token).output().unwrap();
     let refused = record(&[]);
     assert!(!refused.status.success() && String::from_utf8_lossy(&refused.stderr).contains("a token is needed"), "{refused:?}");
     let taken = record(&["--token", &view]);
     assert!(taken.status.success(), "{taken:?}");
-    drop(server);
-    std::fs::remove_dir_all(&folder).unwrap();
 }
 
 #[test]
 fn sockets_end_with_their_token() {
-    let key = Scratch::new("end");
-    make_key_file(&key.0).unwrap();
-    let server = Served::start(&["--listen", "127.0.0.1:0", "--token-key", key.shown()]);
+    let folder = Folder::with_key();
+    let server = serve(&folder.key(), &[]);
     for (role, end) in [(Role::View, "view"), (Role::Publish, "publish")] {
-        let token = make_token(&key.0, role, &["demo".into()], Duration::from_secs(2)).unwrap();
+        let token = folder.token(role, "demo", Duration::from_secs(2));
         let start = Instant::now();
-        let mut socket = server.open(&format!("demo/{end}"), &header(&token)).unwrap();
+        let mut socket = open(&server, &format!("demo/{end}"), &header(&token)).unwrap();
         if role == Role::Publish {
             socket.send(Message::text(r#"{"type":"hello","version":1}"#)).unwrap();
         }
@@ -261,58 +231,43 @@ fn sockets_end_with_their_token() {
 
 #[test]
 fn server_that_others_reach_wants_tokens_or_to_be_told_otherwise() {
-    let output = Command::new(PROGRAM).args(["serve", "--listen", "0.0.0.0:0"]).output().unwrap();
+    let output = program(&["serve", "--listen", "0.0.0.0:0"]).output().unwrap();
     assert!(!output.status.success() && output.stdout.is_empty());
     assert!(String::from_utf8_lossy(&output.stderr).contains("--token-key"), "{output:?}");
     // Datagrams bear no tokens.
-    let key = Scratch::new("reach");
-    make_key_file(&key.0).unwrap();
-    let with_port = |port: &str| {
-        let mut child = Command::new(PROGRAM)
-            .args(["serve", "--listen", "127.0.0.1:0", "--token-key", key.shown(), "--listen-udp", port])
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let _ = child.kill();
-        let mut said = String::new();
-        child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
-        child.wait().unwrap();
-        (line.starts_with("listening"), said)
-    };
-    let (listens, said) = with_port("livelink=0.0.0.0:0");
-    assert!(!listens && said.contains("allow=IP"), "{said}");
-    assert!(with_port("livelink=0.0.0.0:0,allow=192.0.2.1").0);
-    assert!(with_port("livelink=127.0.0.1:0").0);
-    let server = Served::start(&["--listen", "0.0.0.0:0", "--insecure"]);
-    assert!(server.open("demo/view", &[]).is_ok());
-    assert_eq!(server.get("/metrics", None).0, 200);
+    let folder = Folder::with_key();
+    let key = folder.key();
+    let refused = |port: &str| Server::try_start(&[], &["serve", "--token-key", &key, "--listen-udp", port]).err();
+    let said = refused("livelink=0.0.0.0:0").expect("forged addresses are to be expected");
+    assert!(said.contains("allow=IP"), "{said}");
+    assert_eq!(refused("livelink=0.0.0.0:0,allow=192.0.2.1"), None);
+    assert_eq!(refused("livelink=127.0.0.1:0"), None);
+    let server = Server::start(&["serve", "--listen", "0.0.0.0:0", "--insecure"]);
+    assert!(open(&server, "demo/view", &[]).is_ok());
+    assert_eq!(get(&server, "/metrics", None).0, 200);
 }
 
 #[test]
 fn commands_make_keys_tokens_and_use_them() {
-    let (key, feed, token_file) = (Scratch::new("commands"), Scratch::new("feed"), Scratch::new("token"));
-    let run = |args: &[&str]| Command::new(PROGRAM).args(args).env_remove("RHYTID_TOKEN").output().unwrap();
-    assert!(run(&["token", "--new-key", key.shown()]).status.success());
-    assert!(!run(&["token", "--new-key", key.shown()]).status.success(), "a key is never replaced");
-    let made = run(&["token", "--key", key.shown(), "--role", "publish", "--room", "demo", "--for", "1h"]);
+    let folder = Folder(tempfile::tempdir().unwrap());
+    let (key, feed, token_file) = (folder.key(), folder.path("feed"), folder.path("token"));
+    let run = |args: &[&str]| program(args).output().unwrap();
+    assert!(run(&["token", "--new-key", &key]).status.success());
+    assert!(!run(&["token", "--new-key", &key]).status.success(), "a key is never replaced");
+    let made = run(&["token", "--key", &key, "--role", "publish", "--room", "demo", "--for", "1h"]);
     assert!(made.status.success(), "{made:?}");
-    std::fs::write(&token_file.0, &made.stdout).unwrap();
-    std::fs::write(&feed.0, "{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n").unwrap();
-    let server = Served::start(&["--listen", "127.0.0.1:0", "--token-key", key.shown()]);
-    let to = format!("ws://localhost:{}", server.port);
-    let sent = run(&["send", feed.shown(), "--to", &to, "--token-file", token_file.shown()]);
+    std::fs::write(&token_file, &made.stdout).unwrap();
+    std::fs::write(&feed, "{\"type\":\"hello\",\"version\":1}\n{\"type\":\"frame\",\"t\":0,\"weights\":{}}\n").unwrap();
+    let server = serve(&key, &[]);
+    let to = url(&server);
+    let sent = run(&["send", &feed, "--to", &to, "--token-file", &token_file]);
     assert!(sent.status.success(), "{sent:?}");
-    let refused = run(&["send", feed.shown(), "--to", &to]);
+    let refused = run(&["send", &feed, "--to", &to]);
     assert!(String::from_utf8_lossy(&refused.stderr).contains("a token is needed"), "{refused:?}");
-    let in_the_clear = run(&["send", feed.shown(), "--to", "ws://192.0.2.1:9", "--token-file", token_file.shown()]);
+    let in_the_clear = run(&["send", &feed, "--to", "ws://192.0.2.1:9", "--token-file", &token_file]);
     assert!(String::from_utf8_lossy(&in_the_clear.stderr).contains("wss://"), "{in_the_clear:?}");
-    for wrong in [
-        &["token", "--key", key.shown(), "--role", "view"][..],
-        &["token", "--key", key.shown(), "--role", "view", "--room", "a", "--for", "8"],
-    ] {
+    for wrong in [&["token", "--key", &key, "--role", "view"][..], &["token", "--key", &key, "--role", "view", "--room", "a", "--for", "8"]]
+    {
         assert!(!run(wrong).status.success(), "{wrong:?}");
     }
 }

@@ -1,0 +1,67 @@
+//! Three nodes and a real `nats-server`: one face for all of them, whichever dies, stops or is cut off. Where there is no
+//! `nats-server`, all of it shows as ignored.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
+
+fn main() -> std::process::ExitCode {
+    #[cfg(target_os = "linux")]
+    return linux::main();
+    #[cfg(not(target_os = "linux"))]
+    std::process::ExitCode::SUCCESS
+}
+
+// The folder of this file is the module's, too.
+#[cfg(target_os = "linux")]
+#[path = "."]
+mod linux {
+    mod admission;
+    #[path = "../process/http.rs"]
+    mod http;
+    mod namespace;
+    mod nats;
+    mod nodes;
+    mod outages;
+    #[path = "../process/mod.rs"]
+    mod process;
+    mod rooms;
+    mod senders;
+    #[path = "../process/signal.rs"]
+    mod signal;
+    #[path = "../process/socket.rs"]
+    mod socket;
+    #[path = "../process/viewer.rs"]
+    mod viewer;
+    mod watch;
+
+    use libtest_mimic::{Arguments, Trial};
+    use std::process::{ExitCode, Stdio};
+
+    pub fn main() -> ExitCode {
+        let has_nats = nats::nats_server().arg("--version").stdout(Stdio::null()).status().is_ok();
+        if !has_nats {
+            println!("no nats-server on this machine (Debian: apt-get install nats-server): the cluster's tests are ignored");
+        }
+        let trial = |name: &str, test: fn()| {
+            Trial::test(name, move || {
+                test();
+                Ok(())
+            })
+            .with_ignored_flag(!has_nats)
+        };
+        let trials = vec![
+            trial("viewers_at_all_nodes_get_the_same_packets", rooms::viewers_at_all_nodes_get_the_same_packets),
+            trial("late_viewer_elsewhere_gets_the_newest_face_at_once", rooms::late_viewer_elsewhere_gets_the_newest_face_at_once),
+            trial("room_has_one_publisher_in_the_whole_cluster", rooms::room_has_one_publisher_in_the_whole_cluster),
+            trial("face_is_back_with_its_neutral_when_its_node_is_killed", outages::face_is_back_with_its_neutral_when_its_node_is_killed),
+            trial("face_is_back_when_its_node_is_stopped_and_nothing_old_comes_when_it_goes_on", outages::stopped_node),
+            trial("own_rooms_go_on_without_nats_and_all_joins_again_when_it_is_back", outages::nats_dies),
+            trial("rolling_restart_under_load_is_hardly_seen", outages::rolling_restart),
+            trial("tracker_over_udp_holds_its_room_before_all_nodes", rooms::tracker_over_udp),
+            trial("password_and_certificates_of_nats_are_passed_through", admission::password_and_certificates),
+            trial("credentials_of_an_account_are_passed_through", admission::credentials),
+            trial("node_whose_link_is_cut_goes_on_alone_and_joins_again", outages::cut_link)
+                .with_ignored_flag(!has_nats || !namespace::Namespace::is_possible()),
+        ];
+        libtest_mimic::run(&Arguments::from_args(), trials).exit_code()
+    }
+}

@@ -1,0 +1,207 @@
+//! Nodes that die, stop, are restarted or cut off, and NATS that dies: when is the face back?
+
+use super::namespace::{Namespace, ip};
+use super::nats::Nats;
+use super::nodes::{Cluster, HELLO, Node};
+use super::process::{Process, wait_for};
+use super::senders::{send, write_feed};
+use super::signal::{Signal, signal};
+use super::watch::{Watch, num_twice, pause};
+use serde_json::Value;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio_tungstenite::tungstenite::Message;
+
+/// A node is lost: so soon its viewers see the face again.
+const BACK_WITHIN: Duration = Duration::from_secs(2);
+
+pub fn face_is_back_with_its_neutral_when_its_node_is_killed() {
+    let mut cluster = Cluster::start();
+    let addresses: Vec<String> = cluster.nodes.iter().map(|node| node.address.clone()).collect();
+    let [a, b, c] = &addresses.iter().map(String::as_str).collect::<Vec<_>>()[..] else { unreachable!() };
+    let feed = write_feed(cluster.folder.path(), 30);
+    let log = cluster.folder.path().join("send.log");
+    let watches = [Watch::start(&[b], "demo"), Watch::start(&[c], "demo"), Watch::start(&[a, c], "demo")];
+    let mut sender = send(&feed, &[a, b, c], "demo", &log);
+    let neutral_before = wait_for("a neutral", || neutral(&cluster.nodes[0], "demo"));
+    // The settings of the feed have come, too.
+    wait_for("the settings", || {
+        // So many may be asked for.
+        std::thread::sleep(Duration::from_millis(100));
+        (settings(&cluster.nodes[0], "demo")["gains"]["mouth"] == 0.75).then_some(())
+    });
+    std::thread::sleep(Duration::from_millis(300));
+    let session = watches[0].last().expect("it is seen").session;
+
+    cluster.nodes[0].kill();
+    for watch in &watches {
+        wait_for("the next session", || watch.last().filter(|seen| seen.session > session));
+    }
+    std::thread::sleep(Duration::from_millis(500));
+    let neutral_after = neutral(&cluster.nodes[1], "demo").expect("it is kept");
+    assert_eq!((&neutral_after["t"], &neutral_after["num_frames"]), (&neutral_before["t"], &neutral_before["num_frames"]));
+    assert_eq!(settings(&cluster.nodes[1], "demo")["gains"]["mouth"], 0.75);
+    assert!(sender.try_wait().unwrap().is_none(), "{}", std::fs::read_to_string(&log).unwrap());
+    for (watch, node) in watches.into_iter().zip(["b", "c", "a, then c"]) {
+        let seen = watch.finish();
+        println!("killed: viewer at {node}: the face was gone for {:?}", pause(&seen));
+        assert!(pause(&seen) < BACK_WITHIN, "{node}: {:?}", pause(&seen));
+    }
+}
+
+pub fn stopped_node() {
+    let cluster = Cluster::start();
+    let [a, b, c] = &cluster.nodes[..] else { unreachable!() };
+    let feed = write_feed(cluster.folder.path(), 30);
+    let watches = [Watch::start(&[&b.address], "demo"), Watch::start(&[&c.address], "demo")];
+    // Stays where it is, with its connection.
+    let at_stopped = Watch::start(&[&a.address], "demo");
+    let _sender = send(&feed, &[&a.address, &b.address, &c.address], "demo", &cluster.folder.path().join("send.log"));
+    wait_for("a neutral", || neutral(a, "demo"));
+    for watch in &watches {
+        watch.wait_for_more("a face");
+    }
+    let session = at_stopped.wait_for_more("a face").session;
+
+    signal(&a.process, Signal::STOP);
+    for watch in &watches {
+        wait_for("the next session", || watch.last().filter(|seen| seen.session > session));
+    }
+    std::thread::sleep(Duration::from_millis(500));
+    signal(&a.process, Signal::CONT);
+    wait_for("the new session at the node that goes on", || at_stopped.last().filter(|seen| seen.session > session));
+    std::thread::sleep(Duration::from_millis(500));
+    assert!(b.room("demo").unwrap()["publisher"]["source"] == "test", "{}", b.rooms());
+    for (watch, node) in watches.into_iter().zip(["b", "c"]) {
+        let seen = watch.finish();
+        println!("stopped: viewer at {node}: the face was gone for {:?}", pause(&seen));
+        assert!(pause(&seen) < BACK_WITHIN, "{node}: {:?}", pause(&seen));
+        assert_eq!(num_twice(&seen), 0);
+    }
+    assert_eq!(num_twice(&at_stopped.finish()), 0);
+}
+
+pub fn nats_dies() {
+    let mut cluster = Cluster::start();
+    let feed = write_feed(cluster.folder.path(), 60);
+    let (a, b, c) = (&cluster.nodes[0], &cluster.nodes[1], &cluster.nodes[2]);
+    let log = cluster.folder.path().join("send.log");
+    let mut sender = send(&feed, &[&a.address], "demo", &log);
+    let (near, far) = (Watch::start(&[&a.address], "demo"), Watch::start(&[&b.address], "demo"));
+    far.wait_for_more("a face elsewhere");
+    let health = |node: &Node| node.get("/healthz").expect("it says 200");
+    // Once with what it has kept, and once without.
+    for keeps in [true, false] {
+        cluster.nats.kill();
+        for node in [a, b, c] {
+            wait_for("the health to tell it", || health(node).starts_with("degraded").then_some(()));
+        }
+        let mut alone = b.publisher("alone", HELLO).ready();
+        alone.frame(0.3);
+        near.wait_for_more("the face at its own node");
+        std::thread::sleep(Duration::from_secs(1));
+        let before = far.last().unwrap().at;
+        if !keeps {
+            cluster.nats.folder = Arc::new(tempfile::tempdir().unwrap());
+        }
+        cluster.nats.restart();
+        let start = Instant::now();
+        for node in [a, b, c] {
+            wait_for("all to join again", || (health(node) == "ok\n").then_some(()));
+        }
+        wait_for("the face elsewhere", || far.last().filter(|seen| seen.at > before));
+        println!("nats: all have joined again after {:?}, its data {}", start.elapsed(), if keeps { "kept" } else { "lost" });
+        // What was opened in between is the cluster's, too.
+        wait_for("the leases", || {
+            let log = b.log();
+            let num_claimed = log.lines().filter(|line| line.contains("before all nodes") && line.contains("alone")).count();
+            (num_claimed >= if keeps { 1 } else { 2 }).then_some(())
+        });
+        let refused = c.publisher("alone", HELLO).answer();
+        assert_eq!(refused["code"], "room_taken", "{refused}");
+        alone.socket.close(None).unwrap();
+        while alone.socket.read().is_ok() {}
+    }
+    let refused = c.publisher("demo", HELLO).answer();
+    assert_eq!(refused["code"], "room_taken", "{refused}");
+    assert!(sender.try_wait().unwrap().is_none(), "{}", std::fs::read_to_string(&log).unwrap());
+    let near = near.finish();
+    assert!(pause(&near) < Duration::from_millis(700), "the room's own viewer: {:?}", pause(&near));
+    let sessions = near.iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();
+    assert_eq!((sessions.len(), num_twice(&near), num_twice(&far.finish())), (1, 0, 0));
+}
+
+pub fn rolling_restart() {
+    let mut cluster = Cluster::start();
+    let addresses: Vec<String> = cluster.nodes.iter().map(|node| node.address.clone()).collect();
+    let from = |k: usize| (0..3).map(|i| addresses[(k + i) % 3].as_str()).collect::<Vec<_>>();
+    let feed = write_feed(cluster.folder.path(), 60);
+    let folder = cluster.folder.clone();
+    let log = |k: usize| folder.path().join(format!("send-{k}.log"));
+    let mut senders: Vec<Process> = (0..6).map(|k| send(&feed, &from(k), &format!("room-{k}"), &log(k))).collect();
+    let watches: Vec<Watch> = (0..18).map(|k| Watch::start(&from(k / 6), &format!("room-{}", k % 6))).collect();
+    for watch in &watches {
+        watch.wait_for_more("a face");
+    }
+    for k in 0..3 {
+        signal(&cluster.nodes[k].process, Signal::TERM);
+        let status = cluster.nodes[k].process.wait().unwrap();
+        assert!(status.success(), "{status}");
+        cluster.nodes[k] = Node::with(&cluster.nats.url(), &["--listen", &addresses[k]]).ready();
+        std::thread::sleep(Duration::from_millis(500));
+        for watch in &watches {
+            watch.wait_for_more("a face after a restart");
+        }
+    }
+    for (k, sender) in senders.iter_mut().enumerate() {
+        assert!(sender.try_wait().unwrap().is_none(), "{}", std::fs::read_to_string(log(k)).unwrap());
+    }
+    let pauses: Vec<Duration> = watches.into_iter().map(|watch| pause(&watch.finish())).collect();
+    println!("rolling restart: 6 rooms, 18 viewers, longest pause {:?}", pauses.iter().max().unwrap());
+    assert!(pauses.iter().all(|pause| *pause < BACK_WITHIN), "{pauses:?}");
+}
+
+pub fn cut_link() {
+    let namespace = Namespace::make().expect("it was possible before");
+    let [(to_nats, nats_address, _), (_, _, node_address)] = &namespace.cables;
+    let nats = Nats::with(&["-a", nats_address]);
+    let folder = nats.folder.path();
+    let url = format!("nats://{nats_address}:{}", nats.port);
+    let b = Node::start(&url).ready();
+    let inside = Node::inside(&namespace.name, &url, node_address).ready();
+    let feed = write_feed(folder, 60);
+    let log = folder.join("send.log");
+    let mut sender = send(&feed, &[&inside.address], "demo", &log);
+    let (near, far) = (Watch::start(&[&inside.address], "demo"), Watch::start(&[&b.address], "demo"));
+    far.wait_for_more("a face elsewhere");
+    assert!(ip(&format!("link set {to_nats} down")));
+    wait_for("the health to tell it", || inside.get("/healthz").unwrap().starts_with("degraded").then_some(()));
+    near.wait_for_more("the face at its own node");
+    let before = far.last().unwrap().at;
+    assert!(ip(&format!("link set {to_nats} up")));
+    let start = Instant::now();
+    wait_for("it to join again", || (inside.get("/healthz").unwrap() == "ok\n").then_some(()));
+    wait_for("the face elsewhere", || far.last().filter(|seen| seen.at > before));
+    println!("cut link: joined again after {:?}", start.elapsed());
+    assert!(sender.try_wait().unwrap().is_none(), "{}", std::fs::read_to_string(&log).unwrap());
+    let near = near.finish();
+    assert!(pause(&near) < Duration::from_millis(700), "the room's own viewer: {:?}", pause(&near));
+    assert_eq!((num_twice(&near), num_twice(&far.finish())), (0, 0));
+}
+
+/// What a room's home says of the settings in use.
+fn settings(node: &Node, room: &str) -> Value {
+    let mut socket = node.socket(&format!("{room}/control"));
+    socket.send(Message::text(r#"{"type":"settings"}"#)).unwrap();
+    loop {
+        match socket.read().unwrap() {
+            Message::Text(text) => return serde_json::from_str(&text).unwrap(),
+            Message::Close(frame) => panic!("{frame:?}"),
+            _ => {}
+        }
+    }
+}
+
+fn neutral(node: &Node, room: &str) -> Option<Value> {
+    Some(node.room(room)?["neutral"].clone()).filter(|neutral| !neutral.is_null())
+}

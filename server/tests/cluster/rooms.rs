@@ -1,0 +1,108 @@
+//! One room before all nodes: who sees it, and who publishes to it.
+
+use super::nats::{Nats, free_port};
+use super::nodes::{Cluster, HELLO, Node, RawViewer};
+use super::process::wait_for;
+use super::senders::{fake, write_feed};
+use super::watch::Watch;
+use rhytid_shared::packet::{Decoder, PacketLayout};
+use serde_json::json;
+use std::time::{Duration, Instant};
+
+pub fn viewers_at_all_nodes_get_the_same_packets() {
+    let cluster = Cluster::start();
+    let [a, b, c] = &cluster.nodes[..] else { unreachable!() };
+    let mut publisher = a.publisher("demo", HELLO).ready();
+    let mut viewers = [a.viewer("demo"), b.viewer("demo"), c.viewer("demo")];
+    // Until the subscriptions stand: the first packets that all have.
+    publisher.frame(0.0);
+    viewers.iter_mut().for_each(|viewer| drop(viewer.packet()));
+    for k in 1..200 {
+        publisher.frame(f64::from(k % 50) / 50.0);
+        let [first, second, third] = viewers.each_mut().map(RawViewer::packet);
+        assert_eq!((&first, &first), (&second, &third), "packet {k}");
+    }
+    let room = wait_for("the listing of the whole cluster", || {
+        let room = c.room("demo")?;
+        (room["viewers"] == 3 && room["publisher"]["source"] == "test").then_some(room)
+    });
+    assert_eq!(room["nodes"].as_object().unwrap().len(), 3, "{room}");
+    assert_eq!(c.rooms()["nodes"].as_object().unwrap().len(), 3);
+    // Nobody hears what nobody watches there.
+    let unwatched = a.publisher("other", HELLO).ready();
+    drop(unwatched);
+    assert!(!b.log().contains("panicked"));
+}
+
+pub fn late_viewer_elsewhere_gets_the_newest_face_at_once() {
+    let cluster = Cluster::start();
+    let [a, b, _] = &cluster.nodes[..] else { unreachable!() };
+    let mut publisher = a.publisher("demo", HELLO).ready();
+    for k in 0..90 {
+        publisher.frame(f64::from(k) / 90.0);
+    }
+    let mut near = a.viewer("demo");
+    let layout = PacketLayout::try_from(&near.hello.character).unwrap();
+    let newest = |viewer: &mut RawViewer| {
+        let (mut decoder, mut frame) = (Decoder::new(layout.clone()), layout.frame_at_rest());
+        while frame.seq < 89 {
+            decoder.decode(&viewer.packet(), &mut frame).unwrap();
+        }
+        frame
+    };
+    let expected = newest(&mut near);
+    // Nothing more is sent: what comes is what the room's home had.
+    let start = Instant::now();
+    let got = newest(&mut b.viewer("demo"));
+    assert_eq!(got, expected);
+    assert!(start.elapsed() < Duration::from_secs(1), "{:?}", start.elapsed());
+}
+
+pub fn room_has_one_publisher_in_the_whole_cluster() {
+    let cluster = Cluster::start();
+    let [a, b, c] = &cluster.nodes[..] else { unreachable!() };
+    let mut first = a.publisher("demo", HELLO).ready();
+    let refused = b.publisher("demo", HELLO).answer();
+    assert_eq!((&refused["type"], &refused["code"]), (&json!("error"), &json!("room_taken")), "{refused}");
+    let elsewhere = HELLO.replace('}', r#","slot":"phone"}"#);
+    let refused = b.publisher("demo", &elsewhere).answer();
+    assert_eq!(refused["code"], "room_elsewhere", "{refused}");
+    assert!(refused["message"].as_str().unwrap().contains(&a.address), "{refused}");
+    let mut viewer = c.viewer("demo");
+    first.frame(0.2);
+    let before = viewer.packet();
+    let mut second = b.publisher("demo", &HELLO.replace('}', r#","takeover":true}"#)).ready();
+    let told = first.answer();
+    assert_eq!(told["code"], "taken_over", "{told}");
+    second.frame(0.7);
+    let after = viewer.packet();
+    let session = |packet: &[u8]| u32::from_le_bytes(packet[1..5].try_into().unwrap());
+    assert!(session(&after) > session(&before), "{} after {}", session(&after), session(&before));
+    // One who leaves gives the room back.
+    second.socket.close(None).unwrap();
+    while second.socket.read().is_ok() {}
+    a.publisher("demo", HELLO).ready();
+}
+
+pub fn tracker_over_udp() {
+    let nats = Nats::start();
+    let (feed, port) = (write_feed(nats.folder.path(), 20), free_port());
+    let a = Node::with(&nats.url(), &["--listen-udp", &format!("livelink=127.0.0.1:{port},room=demo")]).ready();
+    let b = Node::start(&nats.url()).ready();
+    let phone = fake(&feed, port);
+    let watch = Watch::start(&[&b.address], "demo");
+    watch.wait_for_more("a phone's face at another node");
+    let refused = b.publisher("demo", HELLO).answer();
+    assert_eq!(refused["code"], "room_elsewhere", "{refused}");
+    // A room that is another node's is not the phone's.
+    drop(phone);
+    let mut publisher = b.publisher("demo", &HELLO.replace('}', r#","takeover":true}"#)).ready();
+    let _phone = fake(&feed, port);
+    wait_for("the phone's refusal", || {
+        let metrics = a.get("/metrics")?;
+        metrics.lines().any(|line| line.contains("room_elsewhere") && !line.ends_with(" 0")).then_some(())
+    });
+    publisher.frame(0.3);
+    assert_eq!(a.room("demo").unwrap()["publisher"]["source"], "test");
+    watch.finish();
+}

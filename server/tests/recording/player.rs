@@ -1,0 +1,128 @@
+//! Recordings are played, published again, and exported.
+
+use crate::fixture::{resampled, write_packets};
+use crate::server::{Folder, Recorder, run, says, wait_until};
+use rhytid_server::feed::Feed;
+use rhytid_server::load_character;
+use rhytid_server::recording::{Faces, Recording, export_csv, export_gltf};
+use rhytid_shared::{TrackingData, TrackingFrame};
+
+#[test]
+fn a_player_stops_seeks_and_goes_on() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    let path = folder.path("demo.mcap");
+    let shown = write_packets(&path, &character, &hello, &frames);
+    let served = Recorder::start(&["replay", path.to_str().unwrap(), "--packets"]);
+    let status = || served.json("GET", "/api/rooms/demo/replay", "")["replay"].clone();
+    wait_until("it to move", || status()["position"].as_f64().unwrap() > 0.3);
+    assert_eq!(status()["playing"], true);
+    served.json("POST", "/api/rooms/demo/replay", r#"{"playing":false,"position":12.5}"#);
+    wait_until("it to stand", || status()["playing"] == false && status()["position"] == 12.5);
+    // What a viewer sees is what was recorded there.
+    let watched = folder.path("watched.mcap");
+    let recorded = run(&["record", watched.to_str().unwrap(), "--server", &served.url(), "--seconds", "0.5"]);
+    assert!(recorded.status.success(), "{}", says(&recorded));
+    let mut faces = Faces::new(Recording::open(&watched).unwrap());
+    let mut num = 0;
+    let expected = &shown[frames.partition_point(|frame| frame.t <= 12.5) - 1];
+    while faces.advance().unwrap().is_some() {
+        num += 1;
+        let worst = faces.frame().points.iter().zip(&expected.points).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
+        assert!(worst < 0.001, "{worst} m from the recorded face");
+    }
+    assert!(num >= 5, "a face that stands is sent again: {num}");
+    let before = served.json("GET", "/api/rooms", "")["rooms"][0]["session"].as_u64().unwrap();
+    served.json("POST", "/api/rooms/demo/replay", r#"{"playing":true,"position":1.0,"speed":4.0}"#);
+    wait_until("it to go on", || status()["position"].as_f64().unwrap() > 3.0);
+    let after = served.json("GET", "/api/rooms", "")["rooms"][0]["session"].as_u64().unwrap();
+    assert_eq!(after, before + 1, "a jump begins a session");
+    for (body, code) in [(r#"{"speed":0}"#, 400), (r#"{"position":-1}"#, 400), (r#"{"sped":1}"#, 400), (r#"{"file":"../x.mcap"}"#, 403)] {
+        assert_eq!(served.request("POST", "/api/rooms/demo/replay", body).0, code, "{body}");
+    }
+    assert_eq!(served.request("POST", "/api/rooms/other/replay", r#"{"playing":true}"#).0, 409);
+    served.json("DELETE", "/api/rooms/demo/replay", "");
+    wait_until("the room to be free", || served.json("GET", "/api/rooms", "")["rooms"][0]["publisher"].is_null());
+}
+
+#[test]
+fn a_recording_is_published_again() {
+    let folder = Folder::new();
+    let first = Recorder::into(&folder);
+    assert!(first.send(&["--speed", "max"]).status.success());
+    first.end();
+    let second = Recorder::start(&["serve"]);
+    let path = folder.recording();
+    let replayed = run(&["replay", path.to_str().unwrap(), "--server", &second.url(), "--speed", "max"]);
+    assert!(replayed.status.success() && says(&replayed).contains("sent 501 frames"), "{}", says(&replayed));
+    assert_eq!(second.metric("rhytid_frames_in_total"), 501.0);
+}
+
+#[test]
+fn exports_hold_what_was_recorded() {
+    let folder = Folder::new();
+    let (character, glb) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    let path = folder.path("demo.mcap");
+    let shown = write_packets(&path, &character, &hello, &frames);
+
+    let csv = folder.path("demo.csv");
+    let mut out = Vec::new();
+    let num = export_csv(&mut Faces::new(Recording::open(&path).unwrap()), [0.0, f64::INFINITY], &mut out).unwrap();
+    assert_eq!(num as usize, frames.len());
+    assert!(out.starts_with(b"Timecode,BlendShapeCount,EyeBlinkLeft,"));
+    let header = out.split(|byte| *byte == b'\n').next().unwrap();
+    assert!(header.windows(24).any(|part| part == b"JawForward,JawRight,JawL"), "the order of the app's files");
+    std::fs::write(&csv, &out).unwrap();
+    let mut feed = Feed::open(&csv, &character).unwrap();
+    let (mut frame, mut index) = (TrackingFrame::default(), 0);
+    while feed.next_frame(&mut frame).unwrap().is_some() {
+        let (TrackingData::Weights { weights, head }, Some(expected)) = (&frame.data, shown[index].shapes) else { panic!("{frame:?}") };
+        let worst = weights.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(expected.iter().all(|weight| (0.0..=1.0).contains(weight)), "{expected:?}");
+        assert!(worst <= 0.5 / 255.0 + 1e-6, "{worst}");
+        // Exact zeros say that the head is not sent.
+        let turned = head.unwrap_or_default().rotation.angle_between(shown[index].head.rotation);
+        assert!(turned < 0.0015, "{turned}");
+        index += 1;
+    }
+    assert_eq!(index, frames.len());
+
+    let (file, num) = export_gltf(&mut Faces::new(Recording::open(&path).unwrap()), [2.0, 6.0], &character, &glb).unwrap();
+    assert!((98..=102).contains(&num), "{num}");
+    let gltf = gltf::Gltf::from_slice(&file).unwrap();
+    let names: Vec<_> = gltf.animations().filter_map(|animation| animation.name().map(str::to_owned)).collect();
+    assert_eq!(names, ["bones", "shapes"]);
+    let blob = gltf.blob.as_deref().unwrap();
+    let brow = character.bones.iter().position(|bone| bone.name == "brow_inner_l").unwrap();
+    let bones = gltf.animations().next().unwrap();
+    let channel = bones
+        .channels()
+        .find(|channel| {
+            channel.target().node().name() == Some(&character.bones[brow].joint)
+                && channel.target().property() == gltf::animation::Property::Translation
+        })
+        .expect("the brow moves");
+    let reader = channel.reader(|_| Some(blob));
+    let times: Vec<f32> = reader.read_inputs().unwrap().collect();
+    assert!(times[0] == 0.0 && (times.last().unwrap() - 4.0).abs() < 0.1, "{:?}", times.last());
+    let Some(gltf::animation::util::ReadOutputs::Translations(values)) = reader.read_outputs() else { panic!("translations") };
+    let rest = gltf::Gltf::from_slice(&glb).unwrap();
+    let node = rest.nodes().find(|node| node.name() == Some(&character.bones[brow].joint)).unwrap();
+    let at_rest = glam::Vec3::from(node.transform().decomposed().0);
+    // The face that stands there: the one of 2.0 s arrives a little later.
+    let first = frames.partition_point(|frame| frame.t < 2.0) - 1;
+    for (i, value) in values.enumerate() {
+        // Below the head's joint, which turns nothing at rest: what the point does in head space.
+        let moved = glam::Vec3::from(value) - at_rest;
+        let expected = shown[first + i].points[brow] - character.bones[brow].rest;
+        assert!(moved.distance(expected) < 5e-5, "key {i}: {moved} is not {expected}");
+    }
+    let shapes = gltf.animations().nth(1).unwrap();
+    let weights = shapes.channels().find(|channel| channel.target().property() == gltf::animation::Property::MorphTargetWeights).unwrap();
+    let Some(gltf::animation::util::ReadOutputs::MorphTargetWeights(weights)) = weights.reader(|_| Some(blob)).read_outputs() else {
+        panic!("weights")
+    };
+    assert_eq!(weights.into_f32().count(), times.len() * 52);
+}

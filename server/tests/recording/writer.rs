@@ -1,0 +1,130 @@
+//! Recordings survive what ends them: a request, a kill, a full disk.
+
+use crate::fixture::noise;
+use crate::http::ask;
+use crate::process::{Process, program};
+use crate::server::{Folder, Recorder, run, says, wait_until};
+use rhytid_server::recording::{Faces, Recording, recover};
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+#[test]
+fn a_recording_may_begin_and_end_in_the_middle_of_a_session() {
+    let folder = Folder::new();
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none"]);
+    assert_eq!(served.request("POST", "/api/rooms/demo/record/stop", "").0, 409);
+    let sending = served.keep_sending("1.0");
+    wait_until("frames", || served.metric("rhytid_frames_in_total") > 10.0);
+    let begun = served.json("POST", "/api/rooms/demo/record/start", "");
+    assert!(begun["recording"]["file"].as_str().unwrap().starts_with("demo-"), "{begun}");
+    assert_eq!(served.request("POST", "/api/rooms/demo/record/start", "").0, 409, "once");
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(served.json("GET", "/api/rooms", "")["rooms"][0]["recording"]["bytes"].as_u64().unwrap() > 1000);
+    served.json("POST", "/api/rooms/demo/record/stop", "");
+    wait_until("its end", || served.metric("rhytid_recordings") == 0.0);
+    let listed = served.json("GET", "/api/recordings", "");
+    assert_eq!(listed["recordings"].as_array().unwrap().len(), 1);
+    drop(sending);
+    let recording = Recording::open(&folder.recording()).unwrap();
+    assert_eq!(recording.cut_off(), None, "it is finished");
+    let mut faces = Faces::new(recording);
+    let mut num = 0;
+    while faces.advance().unwrap().is_some() {
+        num += 1;
+    }
+    assert!(num > 20 && faces.num_unreadable() == 0, "{num} faces, {} unreadable", faces.num_unreadable());
+    let verified = run(&["verify", folder.recording().to_str().unwrap()]);
+    assert!(!verified.status.success() && says(&verified).contains("nothing in it can be solved again"), "{}", says(&verified));
+    // Another site's page may not.
+    let origin = ["Origin: http://evil.example"];
+    let (status, answer) = ask(&served.address, "POST", "/api/rooms/demo/record/start", &origin, "").unwrap();
+    assert_eq!(status, 403, "{answer}");
+}
+
+#[test]
+fn a_hundred_kills_lose_the_last_second_at_most() {
+    let folder = Folder::new();
+    let served = Recorder::start(&["serve"]);
+    let _sending = served.keep_sending("1.0");
+    wait_until("frames", || served.metric("rhytid_frames_in_total") > 2.0);
+    let now = || SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs_f64();
+    let (mut worst, mut num_cut, mut num_faces) = (0.0f64, 0, 0);
+    for round in 0..5 {
+        let mut children: Vec<(f64, PathBuf, Process)> = (0..20)
+            .map(|i| {
+                let path = folder.path(&format!("{round}-{i}.mcap"));
+                let mut command = program(&["record", path.to_str().unwrap(), "--server", &served.url()]);
+                let child = Process::start(command.stdout(Stdio::null()).stderr(Stdio::null()));
+                (now() + 0.02 + 2.5 * noise(round * 20 + i), path, child)
+            })
+            .collect();
+        children.sort_by(|a, b| a.0.total_cmp(&b.0));
+        for (at, path, mut child) in children {
+            std::thread::sleep(Duration::from_secs_f64((at - now()).max(0.0)));
+            let killed = now();
+            child.kill().unwrap();
+            child.wait().unwrap();
+            if !path.exists() || std::fs::metadata(&path).unwrap().len() < 200 {
+                // Process before its first chunk: younger than a second.
+                continue;
+            }
+            let report = recover(&path, None).unwrap();
+            assert!(!report.was_whole);
+            num_cut += usize::from(report.cut_off > 0);
+            let recording = Recording::open(&path).unwrap();
+            assert_eq!(recording.cut_off(), None, "it is mended");
+            let start = recording.start() as f64 / 1e9;
+            let mut faces = Faces::new(recording);
+            let mut last = None;
+            while let Some(moment) = faces.advance().unwrap() {
+                last = Some(moment.at);
+                num_faces += 1;
+            }
+            assert_eq!(faces.num_unreadable(), 0);
+            worst = worst.max(killed - (start + last.unwrap_or(0.0)));
+            assert!(recover(&path, None).unwrap().was_whole, "mended once is mended");
+        }
+    }
+    println!("worst loss {worst:.2} s; {num_cut} files were cut inside a chunk; {num_faces} faces in all");
+    assert!(num_faces > 500);
+    // Half a second more for a machine that has better things to do.
+    assert!(worst < 1.5, "{worst} s");
+}
+
+#[test]
+fn a_killed_server_leaves_recordings_that_verify() {
+    let folder = Folder::new();
+    let served = Recorder::into(&folder);
+    let sending = served.keep_sending("1.0");
+    wait_until("frames", || served.metric("rhytid_frames_in_total") > 60.0);
+    drop(served);
+    drop(sending);
+    let path = folder.recording();
+    let verified = run(&["verify", path.to_str().unwrap()]);
+    assert!(verified.status.success(), "before it is mended: {}", says(&verified));
+    let mended = run(&["recover", path.to_str().unwrap()]);
+    assert!(mended.status.success() && says(&mended).contains("kept "), "{}", says(&mended));
+    let verified = run(&["verify", path.to_str().unwrap()]);
+    assert!(verified.status.success(), "{}", says(&verified));
+}
+
+#[test]
+fn a_full_disk_ends_the_recording_and_not_the_stream() {
+    let folder = Folder::new();
+    // 64 blocks of 512 or 1,024 bytes.
+    let limited = ["sh", "-c", r#"ulimit -f 64; exec "$0" "$@""#];
+    let served = Recorder::try_start(&limited, &["serve", "--record", folder.shown()]).unwrap();
+    let sending = served.keep_sending("4.0");
+    wait_until("the failure", || served.metric("rhytid_recording_failures_total") >= 1.0);
+    let before = served.metric("rhytid_frames_in_total");
+    wait_until("more frames", || served.metric("rhytid_frames_in_total") > before + 50.0);
+    let recording = &served.json("GET", "/api/rooms", "")["rooms"][0]["recording"];
+    assert!(recording["error"].as_str().unwrap().contains("File too large"), "{recording}");
+    drop(sending);
+    drop(served);
+    let files = folder.files();
+    assert!(files.iter().all(|file| std::fs::metadata(file).unwrap().len() > 0), "{files:?}");
+    let report = recover(&files[0], None).unwrap();
+    assert!(report.packets > 20, "{report:?}");
+}
