@@ -581,19 +581,19 @@ impl Renderer {
                 if primitive.surface == Surface::Wet && !is_lit {
                     continue;
                 }
-                pass.set_bind_group(2, &primitive.material, &[]);
                 pass.set_vertex_buffer(0, primitive.vertices.slice(..));
                 pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
-                for region in &primitive.regions {
-                    let poses = if has_bones { region.poses } else { 0 };
+                for (region, offset) in primitive.regions.iter().zip((0..).step_by(primitive.region_stride as usize)) {
+                    let has_poses = has_bones && region.poses != 0;
                     let key = Key::new(
                         look,
                         primitive.surface,
                         primitive.is_double_sided,
                         primitive.alpha,
-                        poses,
+                        has_poses,
                         if region.has_zones { zones } else { (0, false) },
                     );
+                    pass.set_bind_group(2, &primitive.material, &[offset]);
                     pass.set_pipeline(self.pipelines.surface(device, key));
                     pass.draw_indexed(region.indices.clone(), 0, 0..1);
                     self.num_draws += 1;
