@@ -8,7 +8,6 @@ use super::regions::{self, Region};
 use super::uniforms;
 use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, Morphs, PrimitiveAsset, Surface, Texels};
 use std::borrow::Cow;
-use std::collections::BTreeSet;
 use std::sync::Arc;
 use wgpu::util::DeviceExt;
 
@@ -143,7 +142,8 @@ impl<'a> Uploader<'a> {
         let skipped = (0..first.levels.len()).find(|&level| side_at(level, 0).max(side_at(level, 1)) <= most).unwrap_or(0);
         let size = wgpu::Extent3d { width: side_at(skipped, 0), height: side_at(skipped, 1), depth_or_array_layers: layers.len() as u32 };
         let num_levels = (first.levels.len() - skipped) as u32;
-        let texels = layers.iter().flat_map(|chain| &chain.levels[skipped..]).map(Vec::as_slice);
+        // The smaller levels follow from the largest.
+        let texels = layers.iter().map(|chain| chain.levels[skipped].as_slice());
         let key = MapKey::new(format, size, num_levels, texels);
         let (device, queue) = (self.device, self.queue);
         self.pooled(key, || {
@@ -392,13 +392,11 @@ pub fn entry(binding: u32, resource: wgpu::BindingResource<'_>) -> wgpu::BindGro
 
 /// Each edge of the triangles once.
 fn edges(indices: &[u32]) -> Vec<u32> {
-    let mut known = BTreeSet::new();
-    for &[a, b, c] in indices.as_chunks::<3>().0 {
-        for (a, b) in [(a, b), (b, c), (c, a)] {
-            known.insert((a.min(b), a.max(b)));
-        }
-    }
-    known.into_iter().flat_map(|(a, b)| [a, b]).collect()
+    let triangles = indices.as_chunks::<3>().0.iter();
+    let mut edges: Vec<[u32; 2]> = triangles.flat_map(|&[a, b, c]| [(a, b), (b, c), (c, a)].map(|(a, b)| [a.min(b), a.max(b)])).collect();
+    edges.sort_unstable();
+    edges.dedup();
+    edges.into_flattened()
 }
 
 #[cfg(test)]
