@@ -53,7 +53,7 @@ pub enum AssetError {
 }
 
 /// A character ready to be uploaded.
-#[derive(Debug)]
+#[derive(Debug, PartialEq)]
 pub struct CharacterAsset {
     /// Its checked description.
     pub character: Arc<Character>,
@@ -74,7 +74,18 @@ pub struct CharacterAsset {
 impl CharacterAsset {
     /// Decodes and checks a whole `.glb`.
     pub fn from_glb(bytes: &[u8]) -> Result<Self, AssetError> {
-        load::load(bytes)
+        load::load(bytes, load::Maps::Decoded)
+    }
+
+    /// Decodes and checks all of a `.glb` but its pictures, each of which one grey texel stands for: what a device needs to get
+    /// ready to draw it, while [`CharacterAsset::fill`] decodes the rest.
+    pub fn outline(bytes: &[u8]) -> Result<Self, AssetError> {
+        load::load(bytes, load::Maps::Blank)
+    }
+
+    /// Decodes the pictures of an outline; `bytes` are those it was made of.
+    pub fn fill(&mut self, bytes: &[u8]) -> Result<(), AssetError> {
+        load::fill(self, bytes)
     }
 
     /// Vertices of all parts.
@@ -84,7 +95,7 @@ impl CharacterAsset {
 }
 
 /// One part of the character.
-#[derive(Debug)]
+#[derive(Debug, PartialEq)]
 pub struct PrimitiveAsset {
     /// The material's name in the file.
     pub name: String,
@@ -195,7 +206,7 @@ pub struct Vertex {
 }
 
 /// Colours and maps of a part.
-#[derive(Debug)]
+#[derive(Debug, PartialEq)]
 pub struct MaterialAsset {
     /// Multiplies the albedo map; linear RGB and alpha.
     pub base_color: [f32; 4],
@@ -230,7 +241,7 @@ pub enum Alpha {
 }
 
 /// Maps of the wrinkle zones (Jimenez et al. 2011).
-#[derive(Debug)]
+#[derive(Debug, PartialEq)]
 pub struct ZoneMaps {
     /// Two layers; zone `i` is channel `i % 4` of layer `i / 4`.
     pub masks: [MipChain; 2],
@@ -249,7 +260,7 @@ pub struct ZoneMaps {
 }
 
 /// All wrinkle maps of a character, one layer a pose.
-#[derive(Debug)]
+#[derive(Debug, PartialEq)]
 pub struct WrinkleMaps {
     /// `o` layers of red and green codes; poses without a map have a layer of code 128.
     pub layers: Vec<MipChain>,
@@ -262,6 +273,19 @@ pub struct WrinkleMaps {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rhytid_shared::DEFAULT_CHARACTER_GLB;
+
+    #[test]
+    fn outline_is_the_character_without_pictures_and_filled_it_is_whole() {
+        let whole = CharacterAsset::from_glb(DEFAULT_CHARACTER_GLB).unwrap();
+        let mut asset = CharacterAsset::outline(DEFAULT_CHARACTER_GLB).unwrap();
+        assert_eq!(asset.primitives[0].vertices, whole.primitives[0].vertices);
+        assert!(asset.primitives.iter().filter_map(|primitive| primitive.material.albedo.as_ref()).all(|map| map.size == [1, 1]));
+        let (outlined, wrinkles) = (asset.wrinkles.as_ref().unwrap(), whole.wrinkles.as_ref().unwrap());
+        assert!(outlined.scales == wrinkles.scales && outlined.layers != wrinkles.layers);
+        asset.fill(DEFAULT_CHARACTER_GLB).unwrap();
+        assert!(asset == whole);
+    }
 
     #[test]
     fn surface_is_read_from_whole_words_of_the_materials_name() {

@@ -14,6 +14,7 @@ mod fullscreen;
 mod headless;
 mod layouts;
 mod map_pool;
+mod model;
 mod picture_texture;
 mod pipelines;
 mod present;
@@ -49,12 +50,11 @@ pub use studio::{Studio, StudioError};
 pub use timing::{Pass, PassTimer};
 pub use view::{BlendError, BlendMode, NameError, Term, ViewError, ViewMode, WrinkleSystem, ZoneBlend};
 
-use crate::asset::{CharacterAsset, Palette, Surface};
+use crate::asset::{CharacterAsset, Surface};
 use anatomy::{Lids, Mouth, eyeballs, gazes};
-use blood::Blood;
 use glam::Vec3;
 use layouts::Layouts;
-use map_pool::PooledMap;
+use model::Model;
 use pipelines::{Key, Look, Pipelines, Wire};
 use present::Presenter;
 use rhytid_shared::Character;
@@ -64,8 +64,7 @@ use shadow::Shadow;
 use std::sync::Arc;
 use targets::Targets;
 use tone::{Shown, Tone};
-use upload::{CharacterGroup, Primitive, Uploader};
-use zones::ZoneScales;
+use upload::Uploader;
 
 /// What one drawing shows and how; changes nothing in the renderer.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -143,17 +142,11 @@ impl DrawSettings {
     }
 }
 
-/// Everything of one character on one device.
+/// A character on a device, and all that draws it.
 #[derive(Debug)]
 pub struct Renderer {
-    character: Arc<Character>,
-    palette: Palette,
-    has_shapes: bool,
-    bounds: Bounds,
-    primitives: Vec<Primitive>,
-    group: CharacterGroup,
-    zone_scales: Option<ZoneScales>,
-    blood: Option<Blood>,
+    model: Model,
+    layouts: Layouts,
     pipelines: Pipelines,
     background: wgpu::RenderPipeline,
     shadow: Shadow,
@@ -175,16 +168,7 @@ pub struct Renderer {
     num_drawn: u32,
     /// Draw calls of the last picture.
     num_draws: u32,
-    static_bytes: u64,
-    /// What the bind groups read from: kept in the pool for as long as this character is drawn.
-    maps: Vec<Arc<PooledMap>>,
     target_format: wgpu::TextureFormat,
-}
-
-/// Maps of a character that is drawn no longer.
-#[derive(Debug)]
-pub struct KeptMaps {
-    _maps: Vec<Arc<PooledMap>>,
 }
 
 /// Metres from one furrow of the forehead to the next: where they cover less than a few pixels, wrinkles fade.
@@ -192,13 +176,6 @@ const FURROW_WAVELENGTH: f32 = 0.006;
 /// How fast light dies in flesh, 1/mm: a translucency of 0.92, where the 0.83 of the demonstration of Jimenez and others
 /// (2010) comes to 0.935 per mm. Tuned by eye on ears against the light.
 const FLESH_PER_MM: f32 = 0.935 * (1.0 - 0.92) / (1.0 - 0.83);
-
-/// Sphere round the neutral character, metres, model space.
-#[derive(Debug, Clone, Copy)]
-struct Bounds {
-    centre: Vec3,
-    radius: f32,
-}
 
 impl Renderer {
     /// Uploads `asset` for pictures of `target_format` (any 8-bit RGBA or BGRA format,
@@ -212,10 +189,8 @@ impl Renderer {
         target_format: wgpu::TextureFormat,
     ) -> Self {
         let layouts = Layouts::new(device);
-        let mut uploader = Uploader::new(device, queue, pool);
-        let primitives: Vec<Primitive> = asset.primitives.iter().map(|primitive| uploader.primitive(&layouts, asset, primitive)).collect();
-        let group = uploader.character(&layouts, asset);
-        let frame_block = uploader.uniform("frame", size_of::<uniforms::Frame>());
+        let model = Model::new(&mut Uploader::new(device, queue, pool), &layouts, asset);
+        let frame_block = frame_block(device);
         let shadow = Shadow::new(device, &layouts);
         let environment = environment_texture(device);
         let frame_group = device.create_bind_group(&wgpu::BindGroupDescriptor {
@@ -236,17 +211,10 @@ impl Renderer {
             entries: &[upload::entry(0, frame_block.as_entire_binding())],
         });
         Self {
-            character: Arc::clone(&asset.character),
-            palette: asset.palette.clone(),
-            has_shapes: !asset.morphs.is_empty(),
-            bounds: Bounds::new(asset),
-            group,
-            zone_scales: asset.zones.as_ref().map(ZoneScales::new),
-            blood: asset.blood.as_ref().map(|maps| Blood::new(&asset.character, maps)),
             pipelines: Pipelines::new(&layouts, asset.character.num_poses()),
+            model,
+            layouts,
             background: background::pipeline(device),
-            static_bytes: uploader.bytes + shadow.bytes,
-            maps: uploader.maps,
             shadow,
             environment,
             lit_by: None,
@@ -261,9 +229,17 @@ impl Renderer {
             height: 1,
             num_drawn: 0,
             num_draws: 0,
-            primitives,
             target_format,
         }
+    }
+
+    /// Draws another character from now on. What draws it stays, and so do maps that both have.
+    pub fn change_character(&mut self, device: &wgpu::Device, queue: &wgpu::Queue, pool: &MapPool, asset: &CharacterAsset) {
+        let model = Model::new(&mut Uploader::new(device, queue, pool), &self.layouts, asset);
+        if model.character.num_poses() != self.model.character.num_poses() {
+            self.pipelines = Pipelines::new(&self.layouts, model.character.num_poses());
+        }
+        self.model = model;
     }
 
     /// Records the drawing of `frame` into `target`, which is `size` pixels large and is overwritten.
@@ -313,12 +289,12 @@ impl Renderer {
 
     /// The character drawn.
     pub fn character(&self) -> &Arc<Character> {
-        &self.character
+        &self.model.character
     }
 
     /// Bytes of the zones' masks and of their wrinkle map.
     pub fn zone_bytes(&self) -> u64 {
-        self.group.zone_bytes
+        self.model.group.zone_bytes
     }
 
     /// Draw calls of the last picture.
@@ -328,24 +304,22 @@ impl Renderer {
 
     /// Bytes of buffers and textures this renderer uses on the device, shared ones included.
     pub fn gpu_bytes(&self) -> u64 {
-        self.static_bytes + self.targets.as_ref().map_or(0, |targets| targets.bytes)
+        self.model.bytes
+            + self.shadow.bytes
+            + size_of::<uniforms::Frame>() as u64
+            + self.targets.as_ref().map_or(0, |targets| targets.bytes)
     }
 
     /// Of those, bytes of maps that another character on the device uses as well.
     pub fn shared_bytes(&self) -> u64 {
-        self.maps.iter().filter(|map| Arc::strong_count(map) > 1).map(|map| map.bytes).sum()
-    }
-
-    /// Drops all but the maps, which are kept until the value is dropped: for the next character, which may have the same.
-    pub fn into_maps(self) -> KeptMaps {
-        KeptMaps { _maps: self.maps }
+        self.model.maps.iter().filter(|map| Arc::strong_count(map) > 1).map(|map| map.bytes).sum()
     }
 
     fn write_uniforms(&mut self, queue: &wgpu::Queue, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) {
         if self.lit_by.is_none_or(|(studio, _)| studio != settings.studio) {
             self.light(queue, settings.studio);
         }
-        let character = &*self.character;
+        let character = &*self.model.character;
         let at_rest;
         let frame = if frame.fits(character) {
             frame
@@ -355,14 +329,14 @@ impl Renderer {
         };
         // The view of what shapes do shows what they do.
         let deform = if settings.view == ViewMode::ShapeDeltas { Deformation::Shapes } else { settings.deform };
-        let weights = deform.weights_of(frame).filter(|_| self.has_shapes);
+        let weights = deform.weights_of(frame).filter(|_| self.model.has_shapes);
         let matrices = match weights {
-            Some(_) => self.palette.model_from_unposed(character, frame),
-            None => self.palette.model_from_rest(character, frame),
+            Some(_) => self.model.palette.model_from_unposed(character, frame),
+            None => self.model.palette.model_from_rest(character, frame),
         };
         let rows: Vec<[[f32; 4]; 3]> = matrices.iter().map(uniforms::rows_of).collect();
-        queue.write_buffer(&self.group.morph_weights, 0, bytemuck::bytes_of(&uniforms::MorphWeights::new(weights)));
-        queue.write_buffer(&self.group.palette, 0, bytemuck::cast_slice(&rows));
+        queue.write_buffer(&self.model.group.morph_weights, 0, bytemuck::bytes_of(&uniforms::MorphWeights::new(weights)));
+        queue.write_buffer(&self.model.group.palette, 0, bytemuck::cast_slice(&rows));
 
         let (num_bones, num_poses) = (character.num_bones(), character.num_poses());
         let mut coefficients = bone_major(&frame.influences, num_bones, num_poses);
@@ -370,19 +344,19 @@ impl Renderer {
         let fade = settings.camera.wrinkle_fade(FURROW_WAVELENGTH, size[1]) * f32::from(u8::from(settings.wrinkles));
         coefficients.iter_mut().flatten().for_each(|coefficient| *coefficient *= fade);
         let mut weights: uniforms::WrinkleWeights = bytemuck::Zeroable::zeroed();
-        if let Some(scales) = &self.zone_scales {
+        if let Some(scales) = &self.model.zone_scales {
             let fade = settings.camera.wrinkle_fade(scales.wavelength, size[1]) * f32::from(u8::from(settings.wrinkles));
             weights = scales.weights(frame, settings.zone_blend, fade);
             self.is_stretched = weights.stretched != [[0.0; 4]; 2];
         }
         weights.active_poses = active_poses(&frame.influences, num_bones);
-        queue.write_buffer(&self.group.wrinkle_weights, 0, bytemuck::bytes_of(&weights));
-        if let Some(blood) = &mut self.blood
+        queue.write_buffer(&self.model.group.wrinkle_weights, 0, bytemuck::bytes_of(&weights));
+        if let Some(blood) = &mut self.model.blood
             && blood.mix(frame)
         {
-            upload::write_blood(queue, &self.group.blood, blood.codes());
+            upload::write_blood(queue, &self.model.group.blood, blood.codes());
         }
-        queue.write_buffer(&self.group.coefficients, 0, bytemuck::cast_slice(&coefficients));
+        queue.write_buffer(&self.model.group.coefficients, 0, bytemuck::cast_slice(&coefficients));
         queue.write_buffer(&self.frame_block, 0, bytemuck::bytes_of(&self.frame_uniforms(size, settings, frame)));
 
         let lens = Lens { aspect: size[0] as f32 / size[1] as f32, fovy: settings.camera.fovy, distance: settings.camera.distance };
@@ -408,10 +382,10 @@ impl Renderer {
 
     /// Whether bones' and zones' wrinkles are drawn: those asked for that the character has and that are near enough.
     fn systems(&self, settings: &DrawSettings) -> (bool, bool) {
-        let has_maps = self.character.poses.iter().any(|pose| pose.map.is_some());
+        let has_maps = self.model.character.poses.iter().any(|pose| pose.map.is_some());
         let height = self.height;
         let is_near = |wavelength: f32| settings.camera.wrinkle_fade(wavelength, height) > 0.0;
-        let zones = self.zone_scales.as_ref().filter(|scales| is_near(scales.wavelength));
+        let zones = self.model.zone_scales.as_ref().filter(|scales| is_near(scales.wavelength));
         let (bones, zones) = (has_maps && is_near(FURROW_WAVELENGTH), zones.is_some_and(|scales| scales.has(settings.zone_blend)));
         match settings.system {
             WrinkleSystem::Own => (bones, zones && !has_maps),
@@ -441,10 +415,10 @@ impl Renderer {
     }
 
     fn frame_uniforms(&self, size: [u32; 2], settings: &DrawSettings, frame: &RenderFrame) -> uniforms::Frame {
-        let character = &*self.character;
+        let character = &*self.model.character;
         // The bust stays while the head travels: a sphere that holds both.
         let travel = frame.head.position;
-        let (centre, radius) = (self.bounds.centre + travel * 0.5, self.bounds.radius + travel.length() * 0.5);
+        let (centre, radius) = (self.model.bounds.centre + travel * 0.5, self.model.bounds.radius + travel.length() * 0.5);
         let head_from_world = character.head_motion(&frame.head).inverse();
         let mouth = Mouth::new(character, frame);
         let lids = [Side::Left, Side::Right].map(|side| Lids::new(character, frame, side));
@@ -471,7 +445,7 @@ impl Renderer {
             lid_arches: [lids[0].upper, lids[0].lower, lids[1].upper, lids[1].lower],
             gazes: gazes(character, frame),
             skin: [FLESH_PER_MM, settings.skin.gloss, settings.skin.roughness, settings.skin.translucency],
-            blood: [self.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],
+            blood: [self.model.blood.as_ref().map_or(0.0, |blood| blood::RANGE * blood.strength() * settings.skin.blood), 0.0, 0.0, 0.0],
             picture: [2.0 * (0.5 * settings.camera.fovy).tan() / size[1] as f32, mirrored_gain, 0.0, 0.0],
             shown: [shown_term(settings.view), mirrored, 0, 0],
             shown_poses: [[shown(0), shown(1), shown(2), shown(3)], [shown(4), shown(5), shown(6), shown(7)]],
@@ -481,8 +455,8 @@ impl Renderer {
     fn draw_shadow(&mut self, encoder: &mut wgpu::CommandEncoder, stamps: Option<wgpu::RenderPassTimestampWrites<'_>>) {
         let mut pass = self.shadow.begin(encoder, stamps);
         pass.set_bind_group(0, &self.frame_group_unlit, &[]);
-        pass.set_bind_group(1, &self.group.group, &[]);
-        for primitive in self.primitives.iter().filter(|primitive| !matches!(primitive.surface, Surface::Wet | Surface::Hair)) {
+        pass.set_bind_group(1, &self.model.group.group, &[]);
+        for primitive in self.model.primitives.iter().filter(|primitive| !matches!(primitive.surface, Surface::Wet | Surface::Hair)) {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
@@ -556,7 +530,7 @@ impl Renderer {
 
     fn draw_primitives(&mut self, device: &wgpu::Device, pass: &mut wgpu::RenderPass<'_>, settings: &DrawSettings, look: Look) {
         pass.set_bind_group(0, &self.frame_group, &[]);
-        pass.set_bind_group(1, &self.group.group, &[]);
+        pass.set_bind_group(1, &self.model.group.group, &[]);
         let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
         let (has_bones, has_zones) = self.systems(settings);
         // A map that nothing shows is not read.
@@ -573,23 +547,23 @@ impl Renderer {
             _ => 0,
         };
         for at in 0..3 {
-            for primitive in self.primitives.iter().filter(|primitive| rank(primitive.surface) == at) {
+            for primitive in self.model.primitives.iter().filter(|primitive| rank(primitive.surface) == at) {
                 if primitive.surface == Surface::Wet && !is_lit {
                     continue;
                 }
-                pass.set_bind_group(2, &primitive.material, &[]);
                 pass.set_vertex_buffer(0, primitive.vertices.slice(..));
                 pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
-                for region in &primitive.regions {
-                    let poses = if has_bones { region.poses } else { 0 };
+                for (region, offset) in primitive.regions.iter().zip((0..).step_by(primitive.region_stride as usize)) {
+                    let has_poses = has_bones && region.poses != 0;
                     let key = Key::new(
                         look,
                         primitive.surface,
                         primitive.is_double_sided,
                         primitive.alpha,
-                        poses,
+                        has_poses,
                         if region.has_zones { zones } else { (0, false) },
                     );
+                    pass.set_bind_group(2, &primitive.material, &[offset]);
                     pass.set_pipeline(self.pipelines.surface(device, key));
                     pass.draw_indexed(region.indices.clone(), 0, 0..1);
                     self.num_draws += 1;
@@ -600,15 +574,15 @@ impl Renderer {
 
     fn draw_wireframe(&mut self, device: &wgpu::Device, pass: &mut wgpu::RenderPass<'_>) {
         pass.set_bind_group(0, &self.frame_group_unlit, &[]);
-        pass.set_bind_group(1, &self.group.group, &[]);
+        pass.set_bind_group(1, &self.model.group.group, &[]);
         pass.set_pipeline(self.pipelines.wire(device, Wire::Body));
-        for primitive in &self.primitives {
+        for primitive in &self.model.primitives {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.indices.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..primitive.num_indices, 0, 0..1);
         }
         pass.set_pipeline(self.pipelines.wire(device, Wire::Edges));
-        for primitive in &self.primitives {
+        for primitive in &self.model.primitives {
             pass.set_vertex_buffer(0, primitive.vertices.slice(..));
             pass.set_index_buffer(primitive.edges.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..primitive.num_edge_indices, 0, 0..1);
@@ -626,6 +600,15 @@ fn shown_term(view: ViewMode) -> u32 {
     }
 }
 
+fn frame_block(device: &wgpu::Device) -> wgpu::Buffer {
+    device.create_buffer(&wgpu::BufferDescriptor {
+        label: Some("frame"),
+        size: size_of::<uniforms::Frame>() as u64,
+        usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+        mapped_at_creation: false,
+    })
+}
+
 fn environment_texture(device: &wgpu::Device) -> wgpu::Texture {
     device.create_texture(&wgpu::TextureDescriptor {
         label: Some("environment"),
@@ -637,16 +620,4 @@ fn environment_texture(device: &wgpu::Device) -> wgpu::Texture {
         usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
         view_formats: &[],
     })
-}
-
-impl Bounds {
-    fn new(asset: &CharacterAsset) -> Self {
-        let positions =
-            || asset.primitives.iter().flat_map(|primitive| primitive.vertices.iter().map(|vertex| Vec3::from(vertex.position)));
-        let (low, high) =
-            positions().fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), position| (low.min(position), high.max(position)));
-        let centre = (low + high) * 0.5;
-        let radius = positions().map(|position| position.distance(centre)).fold(0.01, f32::max);
-        Self { centre, radius }
-    }
 }

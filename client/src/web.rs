@@ -25,6 +25,7 @@ const MAX_MS: f64 = 9e12;
 pub struct Viewer {
     canvas: Canvas,
     scene: Option<Scene>,
+    arriving: Option<Arriving>,
     hello: Option<ViewHello>,
     decoder: Option<(Decoder, FaceFrame)>,
     /// The socket is there.
@@ -40,6 +41,13 @@ pub struct Viewer {
     now_ms: f64,
     newest: Option<FaceFrame>,
     is_transparent: bool,
+}
+
+/// A character whose pictures are still to be decoded.
+struct Arriving {
+    glb: Vec<u8>,
+    sha256: String,
+    asset: CharacterAsset,
 }
 
 /// What hangs on the character.
@@ -78,6 +86,7 @@ impl Viewer {
         Ok(Self {
             canvas,
             scene: None,
+            arriving: None,
             hello: None,
             decoder: None,
             is_linked: false,
@@ -107,16 +116,32 @@ impl Viewer {
         self.canvas.failure()
     }
 
-    /// Makes the character of a `.glb` the one that is drawn. Where a hello has come it must be the one that names.
-    #[wasm_bindgen(js_name = loadCharacter)]
-    pub fn load_character(&mut self, glb: &[u8]) -> Result<(), JsError> {
-        let sha256: String = Sha256::digest(glb).iter().map(|byte| format!("{byte:02x}")).collect();
+    /// First half of making the character of a `.glb` the one that is drawn: all but its pictures. Where a hello has come it must
+    /// be the one that names. What draws is being compiled when this returns; let the browser do something of its own then.
+    #[wasm_bindgen(js_name = beginCharacter)]
+    pub fn begin_character(&mut self, glb: Vec<u8>) -> Result<(), JsError> {
+        let sha256: String = Sha256::digest(&glb).iter().map(|byte| format!("{byte:02x}")).collect();
         if let Some(hello) = &self.hello
             && hello.character.sha256 != sha256
         {
             return Err(error(format!("the character that came has SHA-256 {sha256}, the server names {}", hello.character.sha256)));
         }
-        let asset = CharacterAsset::from_glb(glb).map_err(error)?;
+        let asset = CharacterAsset::outline(&glb).map_err(error)?;
+        // Whoever sees a face already goes on seeing it till the next one is there.
+        if self.scene.is_none() {
+            let settings = DrawSettings { is_transparent: self.is_transparent, ..DrawSettings::new(Camera::front(&asset.character)) };
+            self.canvas.upload(&asset);
+            self.canvas.rehearse(&settings, &RenderFrame::at_rest(&asset.character));
+        }
+        self.arriving = Some(Arriving { glb, sha256, asset });
+        Ok(())
+    }
+
+    /// The second half: pictures are decoded, and the character is drawn from now on.
+    #[wasm_bindgen(js_name = finishCharacter)]
+    pub fn finish_character(&mut self) -> Result<(), JsError> {
+        let Some(Arriving { glb, sha256, mut asset }) = self.arriving.take() else { return Err(error("no character has begun to come")) };
+        asset.fill(&glb).map_err(error)?;
         let character = &asset.character;
         let mut settings = DrawSettings::new(Camera::front(character));
         settings.is_transparent = self.is_transparent;

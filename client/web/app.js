@@ -175,8 +175,8 @@ async function greeted(text) {
       const glb = await fetched(hello.character);
       performance.mark("rhytid:fetched");
       // Another hello may have come meanwhile, or another viewer.
-      if (character.sha256 !== hello.character.sha256 || current !== viewer) return;
-      current.load(glb, hello.character.sha256);
+      const isWanted = () => character?.sha256 === hello.character.sha256 && current === viewer;
+      if (!isWanted() || !(await current.load(glb, hello.character.sha256, isWanted))) return;
       puppet.setExpressions(expressionNames(glb));
     }
     if (isOther) {

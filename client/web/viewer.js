@@ -74,14 +74,25 @@ export class FaceViewer {
     this.client.hello(text);
   }
 
-  /** @param {Uint8Array} glb @param {string} sha256 */
-  load(glb, sha256) {
-    this.client.loadCharacter(glb);
+  /**
+   * Makes a character the one that is drawn, and gives the browser a moment half-way: what draws is compiled beside this.
+   * @param {Uint8Array} glb @param {string} sha256 @param {() => boolean} isWanted asked after that moment
+   * @returns {Promise<boolean>} whether it still was wanted
+   */
+  async load(glb, sha256, isWanted) {
+    this.client.beginCharacter(glb);
+    performance.mark("rhytid:outline");
+    await new Promise((resolve) => setTimeout(resolve));
+    if (!isWanted()) return false;
+    // The same may have come twice, by a socket that broke.
+    if (this.loadedHash === sha256) return true;
+    this.client.finishCharacter();
     performance.mark("rhytid:character");
     this.loadedHash = sha256;
     for (const [name, value] of this.switches) this.client.setSwitch(name, value);
     if (this.views().includes(this.view)) this.client.setView(this.view);
     else this.view = "beauty";
+    return true;
   }
 
   /** @param {Uint8Array} bytes @param {number} nowMs */

@@ -6,7 +6,7 @@ import { WEBGPU, check, launch, open, roomName, run, until } from "./lib.mjs";
 const backend = process.env.RHYTID_BACKEND ?? "webgl";
 const most = Number(process.env.RHYTID_MOST ?? 20);
 /** Marks of the page, and what has been done by then. */
-const STAGES = { module: "module compiled", device: "graphics device", fetched: "character fetched", character: "character decoded and uploaded", drawn: "picture recorded", picture: "picture shown" };
+const STAGES = { module: "module compiled", device: "graphics device", fetched: "character fetched", outline: "pipelines begun", character: "character decoded and uploaded", drawn: "picture recorded", picture: "picture shown" };
 
 await run(async () => {
   const browser = await launch(...(backend === "webgpu" ? WEBGPU : []));

@@ -28,7 +28,9 @@ async function draw({ backend, size, hello, packets, draws }) {
   const glb = new Uint8Array(await (await fetch(JSON.parse(hello).character.url)).arrayBuffer());
   step("character fetched");
   viewer.hello(hello);
-  await viewer.loadCharacter(glb);
+  viewer.beginCharacter(glb);
+  step("character begun");
+  viewer.finishCharacter();
   step("character ready");
   viewer.resize(size, size);
   let png = "";

@@ -5,7 +5,7 @@ use super::gradients::weight_gradients;
 use super::joints::{JointMotion, Palette};
 use super::mips::{MipChain, Texels};
 use super::morphs::{MorphedMesh, Morphs};
-use super::{Alpha, AssetError, CharacterAsset, MaterialAsset, PrimitiveAsset, Surface, Vertex, WrinkleMaps, ZoneMaps};
+use super::{Alpha, AssetError, BloodMaps, CharacterAsset, MaterialAsset, PrimitiveAsset, Surface, Vertex, WrinkleMaps, ZoneMaps};
 use glam::{Vec2, Vec3};
 use image::RgbaImage;
 use rhytid_shared::{ArkitShape, Character, CharacterError};
@@ -17,13 +17,14 @@ type Result<T> = std::result::Result<T, AssetError>;
 /// Code of slope 0 in a map of partial derivatives.
 const FLAT_CODE: u8 = 128;
 
-pub(super) fn load(bytes: &[u8]) -> Result<CharacterAsset> {
+/// Decodes all of a character, or with `Maps::Blank` all but its pictures.
+pub(super) fn load(bytes: &[u8], maps: Maps) -> Result<CharacterAsset> {
     // Everything that could make the reading below panic or grow without limit has been refused once this returns.
     let character = Character::from_glb(bytes)?;
     let gltf = gltf::Gltf::from_slice(bytes).map_err(|error| CharacterError::Glb(error.to_string()))?;
     let blob = gltf.blob.as_deref().unwrap_or_default();
     let (palette, entry_of_joint) = build_palette(&gltf.document, &character);
-    let mut images = Images { document: &gltf.document, blob, last: None };
+    let mut images = Images { document: &gltf.document, blob, maps, last: None };
 
     let mut primitives = Vec::new();
     let mut morphs = Morphs::default();
@@ -43,10 +44,29 @@ pub(super) fn load(bytes: &[u8]) -> Result<CharacterAsset> {
             });
         }
     }
-    let wrinkles = read_wrinkles(&character, &mut images)?;
-    let zones = read_zones(&character, &mut images)?;
-    let blood = blood::read(&character, |texture| images.of_texture(texture).map(|image| image.cloned()))?;
-    Ok(CharacterAsset { character: Arc::new(character), primitives, palette, morphs, wrinkles, zones, blood })
+    let read = read_maps(&character, &mut images)?;
+    Ok(CharacterAsset { character: Arc::new(character), primitives, palette, morphs, wrinkles: read.0, zones: read.1, blood: read.2 })
+}
+
+/// Reads the pictures that `load` has left blank from the same file.
+pub(super) fn fill(asset: &mut CharacterAsset, bytes: &[u8]) -> Result<()> {
+    let gltf = gltf::Gltf::from_slice(bytes).map_err(|error| CharacterError::Glb(error.to_string()))?;
+    let blob = gltf.blob.as_deref().unwrap_or_default();
+    let mut images = Images { document: &gltf.document, blob, maps: Maps::Decoded, last: None };
+    let materials = gltf.document.meshes().flat_map(|mesh| mesh.primitives().map(|primitive| primitive.material()).collect::<Vec<_>>());
+    for (primitive, material) in asset.primitives.iter_mut().zip(materials) {
+        primitive.material = read_material(&material, &mut images)?;
+    }
+    (asset.wrinkles, asset.zones, asset.blood) = read_maps(&asset.character, &mut images)?;
+    Ok(())
+}
+
+/// Maps that belong to the character rather than to one of its materials.
+fn read_maps(character: &Character, images: &mut Images<'_>) -> Result<(Option<WrinkleMaps>, Option<ZoneMaps>, Option<BloodMaps>)> {
+    let wrinkles = read_wrinkles(character, images)?;
+    let zones = read_zones(character, images)?;
+    let blood = blood::read(character, |texture| images.of_texture(texture).map(|image| image.cloned()))?;
+    Ok((wrinkles, zones, blood))
 }
 
 /// Names from a joint up to the root.
@@ -250,7 +270,17 @@ fn vertex_tangents(positions: &[Vec3], normals: &[Vec3], uvs: &[Vec2], indices: 
 struct Images<'a> {
     document: &'a gltf::Document,
     blob: &'a [u8],
+    maps: Maps,
     last: Option<(usize, RgbaImage)>,
+}
+
+/// What is read of a file's pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Maps {
+    /// All.
+    Decoded,
+    /// Nothing: a grey texel, which is flat where it is read as a slope, stands for each.
+    Blank,
 }
 
 impl Images<'_> {
@@ -260,6 +290,10 @@ impl Images<'_> {
         if self.last.as_ref().is_none_or(|(last, _)| *last != index) {
             let gltf::image::Source::View { view, .. } = texture.source().source() else { return Ok(None) };
             self.last = None;
+            if self.maps == Maps::Blank {
+                let blank = RgbaImage::from_pixel(1, 1, image::Rgba([FLAT_CODE; 4]));
+                return Ok(Some(&self.last.insert((index, blank)).1));
+            }
             let bytes = self.blob.get(view.offset()..view.offset() + view.length()).unwrap_or_default();
             let image = image::load_from_memory(bytes).map_err(|source| AssetError::Image { index, source })?;
             self.last = Some((index, image.into_rgba8()));

@@ -1,6 +1,7 @@
 //! Mip chains made on the CPU, each kind of texel averaged by its meaning.
 
 use image::RgbaImage;
+use std::sync::LazyLock;
 
 /// What the texels of a map mean: decides how four of them become one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -70,46 +71,39 @@ impl MipChain {
     }
 }
 
-fn halve(from: &[u8], [width, height]: [u32; 2], [to_width, to_height]: [u32; 2], texels: Texels) -> Vec<u8> {
-    let size = texels.size();
-    let mut to = Vec::with_capacity(to_width as usize * to_height as usize * size);
-    let linear = linear_from_srgb_table();
+fn halve(from: &[u8], size: [u32; 2], to: [u32; 2], texels: Texels) -> Vec<u8> {
+    match texels {
+        Texels::Slopes | Texels::Linear2 => halve_by(from, size, to, quarters::<2>),
+        Texels::Linear4 => halve_by(from, size, to, quarters::<4>),
+        Texels::AlbedoSrgb => halve_by(from, size, to, |four| SRGB.mean(four)),
+    }
+}
+
+/// `mean` makes one texel of four: the upper two, then the lower two. Beyond an odd edge the last texel counts twice.
+fn halve_by<const N: usize>(
+    from: &[u8],
+    [width, height]: [u32; 2],
+    [to_width, to_height]: [u32; 2],
+    mean: impl Fn([[u8; N]; 4]) -> [u8; N],
+) -> Vec<u8> {
+    let [width, height, to_width, to_height] = [width, height, to_width, to_height].map(|side| side as usize);
+    let from = from.as_chunks::<N>().0;
+    let mut to = Vec::with_capacity(to_width * to_height * N);
     for y in 0..to_height {
-        for x in 0..to_width {
-            let texel = |dx: u32, dy: u32| {
-                let at = ((2 * y + dy).min(height - 1) * width + (2 * x + dx).min(width - 1)) as usize * size;
-                &from[at..at + size]
-            };
-            let four = [texel(0, 0), texel(1, 0), texel(0, 1), texel(1, 1)];
-            match texels {
-                Texels::Slopes | Texels::Linear2 => {
-                    for channel in 0..2 {
-                        let sum: u32 = four.iter().map(|texel| u32::from(texel[channel])).sum();
-                        to.push(quarter(sum));
-                    }
-                }
-                Texels::Linear4 => {
-                    for channel in 0..4 {
-                        to.push(quarter(four.iter().map(|texel| u32::from(texel[channel])).sum()));
-                    }
-                }
-                Texels::AlbedoSrgb => {
-                    let alpha: f32 = four.iter().map(|texel| f32::from(texel[3])).sum();
-                    for channel in 0..3 {
-                        let light = |texel: &&[u8]| linear[usize::from(texel[channel])];
-                        let mean = if alpha > 0.0 {
-                            four.iter().map(|texel| light(texel) * f32::from(texel[3])).sum::<f32>() / alpha
-                        } else {
-                            four.iter().map(light).sum::<f32>() / 4.0
-                        };
-                        to.push(srgb_from_linear(mean));
-                    }
-                    to.push((alpha / 4.0 + 0.5) as u8);
-                }
-            }
+        let row = |dy: usize| &from[(2 * y + dy).min(height - 1) * width..][..width];
+        let (upper, lower) = (row(0), row(1));
+        if width == 1 {
+            to.extend(mean([upper[0], upper[0], lower[0], lower[0]]));
+        }
+        for (upper, lower) in upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0) {
+            to.extend(mean([upper[0], upper[1], lower[0], lower[1]]));
         }
     }
     to
+}
+
+fn quarters<const N: usize>(four: [[u8; N]; 4]) -> [u8; N] {
+    std::array::from_fn(|channel| quarter(four.iter().map(|texel| u32::from(texel[channel])).sum()))
 }
 
 /// A fourth of the sum of four codes. Halves go to the even code: always up would tilt a surface by an eighth of a code a
@@ -119,16 +113,57 @@ fn quarter(sum: u32) -> u8 {
     (down + u32::from(left_over == 3 || (left_over == 2 && down % 2 == 1))) as u8
 }
 
-fn linear_from_srgb_table() -> [f32; 256] {
-    std::array::from_fn(|code| {
-        let encoded = code as f32 / 255.0;
-        if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
-    })
+static SRGB: LazyLock<Srgb> = LazyLock::new(Srgb::new);
+
+/// The sRGB curve as tables: a power for each texel is what an albedo map's chain would take longest for.
+struct Srgb {
+    /// Light of a code.
+    linear: [f32; 256],
+    /// Least light that becomes a code, and for the last code's sake one that none reaches.
+    least: [f32; 257],
+    /// The code of the least light of each of `BINS` equal shares of it.
+    code: Vec<u8>,
 }
 
-fn srgb_from_linear(linear: f32) -> u8 {
-    let encoded = if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
-    (encoded * 255.0 + 0.5) as u8
+impl Srgb {
+    /// Enough that no share holds more than a few codes.
+    const BINS: usize = 2048;
+
+    fn new() -> Self {
+        let linear_of = |encoded: f32| if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) };
+        let least = std::array::from_fn(|code| match code {
+            0 => 0.0,
+            256 => f32::INFINITY,
+            code => linear_of((code as f32 - 0.5) / 255.0),
+        });
+        let code_of = |light: f32| (least.partition_point(|least| *least <= light) - 1) as u8;
+        Self {
+            linear: std::array::from_fn(|code| linear_of(code as f32 / 255.0)),
+            code: (0..=Self::BINS).map(|bin| code_of(bin as f32 / Self::BINS as f32)).collect(),
+            least,
+        }
+    }
+
+    /// The nearest code; light above 1 is white.
+    fn encode(&self, light: f32) -> u8 {
+        let mut code = self.code[((light * Self::BINS as f32) as usize).min(Self::BINS)];
+        while light >= self.least[usize::from(code) + 1] {
+            code += 1;
+        }
+        code
+    }
+
+    /// Mean light, weighted by alpha where there is any.
+    fn mean(&self, four: [[u8; 4]; 4]) -> [u8; 4] {
+        let alphas = four.map(|texel| f32::from(texel[3]));
+        let alpha: f32 = alphas.iter().sum();
+        let (shares, whole) = if alpha > 0.0 { (alphas, alpha) } else { ([1.0; 4], 4.0) };
+        let light = |channel: usize| {
+            let sum: f32 = four.iter().zip(shares).map(|(texel, share)| self.linear[usize::from(texel[channel])] * share).sum();
+            self.encode(sum / whole)
+        };
+        [light(0), light(1), light(2), (alpha / 4.0 + 0.5) as u8]
+    }
 }
 
 #[cfg(test)]
@@ -198,6 +233,28 @@ mod tests {
     fn albedo_averages_light_not_codes() {
         let chain = MipChain::from_texels([2, 1], Texels::AlbedoSrgb, vec![0, 0, 0, 255, 255, 255, 255, 255]);
         assert_eq!(chain.levels[1], [188, 188, 188, 255]);
+    }
+
+    #[test]
+    fn every_code_survives_the_tables_of_srgb_and_light_between_two_goes_to_the_nearer() {
+        let encoded = |light: f32| if light <= 0.003_130_8 { light * 12.92 } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 };
+        for code in 0..=255 {
+            assert_eq!(SRGB.encode(SRGB.linear[usize::from(code)]), code);
+        }
+        for i in 0..=100_000 {
+            let light = i as f32 / 100_000.0;
+            let (got, exact) = (f32::from(SRGB.encode(light)), encoded(light) * 255.0);
+            assert!((got - exact).abs() < 0.501, "{light} becomes {got}, {exact} expected");
+        }
+        assert_eq!(SRGB.encode(1.5), 255);
+    }
+
+    #[test]
+    fn odd_edges_count_no_texel_of_another_row() {
+        let chain = MipChain::from_texels([3, 1], Texels::Linear2, vec![10, 20, 30, 40, 250, 250]);
+        assert_eq!(chain.levels[1], [20, 30]);
+        let chain = MipChain::from_texels([1, 3], Texels::Linear2, vec![10, 20, 30, 40, 250, 250]);
+        assert_eq!(chain.levels[1], [20, 30]);
     }
 
     #[test]

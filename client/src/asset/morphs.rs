@@ -109,8 +109,12 @@ impl Morphs {
             }
             let gradient_of = slopes.gradients(mesh.indices, &deltas);
             for vertex in (0..deltas.len()).filter(|vertex| slopes.is_used[*vertex]) {
-                let displacement = deltas[vertex];
-                let gradients = mesh.frames[vertex].map(|along| (gradient_of[slopes.places.of[vertex]] * along).clamp_length_max(STEEPEST));
+                let (displacement, gradient) = (deltas[vertex], gradient_of[slopes.places.of[vertex]]);
+                // Most shapes leave most of a face alone.
+                if displacement == Vec3::ZERO && gradient == Mat3::ZERO {
+                    continue;
+                }
+                let gradients = mesh.frames[vertex].map(|along| (gradient * along).clamp_length_max(STEEPEST));
                 if displacement.length() >= LEAST_TRAVEL || gradients.iter().any(|gradient| gradient.length() >= LEAST_TURN) {
                     entries_of[vertex].push(MorphEntry { shape: shape.index(), displacement, gradients });
                     num_entries += 1;

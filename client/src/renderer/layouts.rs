@@ -60,7 +60,14 @@ impl Layouts {
         let map = |at| binding(at, Stages::FRAGMENT, texture(filtered, wgpu::TextureViewDimension::D2));
         let material = group(
             "material",
-            &[uniform(0, Stages::FRAGMENT, size_of::<uniforms::Material>()), map(1), map(2), map(3), binding(4, Stages::FRAGMENT, sampler)],
+            &[
+                uniform(0, Stages::FRAGMENT, size_of::<uniforms::Material>()),
+                map(1),
+                map(2),
+                map(3),
+                binding(4, Stages::FRAGMENT, sampler),
+                chosen_uniform(5, Stages::FRAGMENT, size_of::<uniforms::Region>()),
+            ],
         );
         let pipeline = |label: &str, groups: &[Option<&wgpu::BindGroupLayout>]| {
             device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
@@ -77,12 +84,20 @@ impl Layouts {
 
 /// A uniform block of `size` bytes.
 pub fn uniform(at: u32, visibility: wgpu::ShaderStages, size: usize) -> wgpu::BindGroupLayoutEntry {
-    let ty = wgpu::BindingType::Buffer {
+    binding(at, visibility, uniform_block(size, false))
+}
+
+/// One of several uniform blocks of `size` bytes in a buffer; the draw call says which.
+fn chosen_uniform(at: u32, visibility: wgpu::ShaderStages, size: usize) -> wgpu::BindGroupLayoutEntry {
+    binding(at, visibility, uniform_block(size, true))
+}
+
+fn uniform_block(size: usize, has_dynamic_offset: bool) -> wgpu::BindingType {
+    wgpu::BindingType::Buffer {
         ty: wgpu::BufferBindingType::Uniform,
-        has_dynamic_offset: false,
+        has_dynamic_offset,
         min_binding_size: std::num::NonZeroU64::new(size as u64),
-    };
-    binding(at, visibility, ty)
+    }
 }
 
 /// A texture read one sample a texel.

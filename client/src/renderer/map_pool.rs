@@ -11,7 +11,7 @@ pub struct MapKey {
     /// Width and height in texels, number of layers.
     size: [u32; 3],
     num_levels: u32,
-    /// SHA-256 of the texels of all layers and levels before they are compressed: characters come from strangers, and a
+    /// SHA-256 of the texels of all layers before they are compressed, largest level: characters come from strangers, and a
     /// weaker hash would let one put its maps on another.
     digest: [u8; 32],
 }

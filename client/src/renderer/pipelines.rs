@@ -44,8 +44,8 @@ pub struct Key {
     pub shader: ShaderKind,
     pub is_double_sided: bool,
     pub has_coverage: bool,
-    /// Poses whose maps are read, one bit each.
-    pub poses: u8,
+    /// Maps of poses are read: those that the region names.
+    pub has_poses: bool,
     /// How zones are blended, as the shader counts it; 0 for none.
     pub zones: u8,
     /// Stretched zones have a map.
@@ -74,8 +74,8 @@ impl From<Surface> for ShaderKind {
     }
 }
 
-/// Pipelines for a character's triangles, each built when it first draws: a character has hundreds of them, a picture
-/// needs a dozen.
+/// Pipelines for a character's triangles, each built when it first draws: a character has dozens of them, a picture
+/// needs ten.
 #[derive(Debug)]
 pub struct Pipelines {
     surface_layout: wgpu::PipelineLayout,
@@ -152,7 +152,7 @@ impl Pipelines {
             let constants = [
                 ("NUM_POSES", self.num_poses as f64),
                 ("BLEND", blend as f64),
-                ("POSES", f64::from(key.poses)),
+                ("POSES", if key.has_poses { f64::from(u8::MAX) } else { 0.0 }),
                 ("ZONES", f64::from(key.zones)),
                 ("ZONES_STRETCH", f64::from(u8::from(key.has_stretch))),
             ];
@@ -220,10 +220,17 @@ impl Key {
     }
 
     /// What no pose can wrinkle, and all that is not skin, is drawn bare when the face is drawn with wrinkles.
-    pub fn new(look: Look, surface: Surface, is_double_sided: bool, alpha: Alpha, poses: u8, (zones, has_stretch): (u8, bool)) -> Self {
+    pub fn new(
+        look: Look,
+        surface: Surface,
+        is_double_sided: bool,
+        alpha: Alpha,
+        has_poses: bool,
+        (zones, has_stretch): (u8, bool),
+    ) -> Self {
         let shader = ShaderKind::from(surface);
         let look = match look {
-            Look::Wrinkled(_) if shader != ShaderKind::Skin || (poses == 0 && zones == 0) => Look::Bare,
+            Look::Wrinkled(_) if shader != ShaderKind::Skin || (!has_poses && zones == 0) => Look::Bare,
             look => look,
         };
         let is_lit = matches!(look, Look::Wrinkled(_) | Look::Bare);
@@ -236,7 +243,7 @@ impl Key {
             shader: if is_lit { shader } else { ShaderKind::Plain },
             is_double_sided,
             has_coverage: is_lit && alpha == Alpha::Coverage && shader == ShaderKind::Hair,
-            poses: if is_wrinkled { poses } else { 0 },
+            has_poses: is_wrinkled && has_poses,
         }
     }
 }

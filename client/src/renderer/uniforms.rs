@@ -154,6 +154,17 @@ pub struct WrinkleWeights {
 }
 assert_layout!(WrinkleWeights, wrinkle_weights, { wrinkled: WRINKLED, stretched: STRETCHED, active_poses: ACTIVE_POSES });
 
+/// What the triangles of a draw call have in common.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Region {
+    /// One bit for each pose that can wrinkle them.
+    pub poses: u32,
+    /// Fills the block up.
+    pub padding: [u32; 3],
+}
+assert_layout!(Region, region, { poses: POSES });
+
 /// Group 2.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]

@@ -8,7 +8,6 @@ use super::regions::{self, Region};
 use super::uniforms;
 use crate::asset::{Alpha, CharacterAsset, MaterialAsset, MipChain, Morphs, PrimitiveAsset, Surface, Texels};
 use std::borrow::Cow;
-use std::collections::BTreeSet;
 use std::sync::Arc;
 use wgpu::util::DeviceExt;
 
@@ -44,7 +43,10 @@ pub struct Primitive {
     /// Each edge once, as pairs of indices.
     pub edges: wgpu::Buffer,
     pub num_edge_indices: u32,
+    /// Group 2; a draw call adds the offset of its region's block.
     pub material: wgpu::BindGroup,
+    /// Bytes from one region's block to the next.
+    pub region_stride: u32,
 }
 
 /// What of a character changes from frame to frame, its shapes and its wrinkle maps: group 1.
@@ -140,7 +142,8 @@ impl<'a> Uploader<'a> {
         let skipped = (0..first.levels.len()).find(|&level| side_at(level, 0).max(side_at(level, 1)) <= most).unwrap_or(0);
         let size = wgpu::Extent3d { width: side_at(skipped, 0), height: side_at(skipped, 1), depth_or_array_layers: layers.len() as u32 };
         let num_levels = (first.levels.len() - skipped) as u32;
-        let texels = layers.iter().flat_map(|chain| &chain.levels[skipped..]).map(Vec::as_slice);
+        // The smaller levels follow from the largest.
+        let texels = layers.iter().map(|chain| chain.levels[skipped].as_slice());
         let key = MapKey::new(format, size, num_levels, texels);
         let (device, queue) = (self.device, self.queue);
         self.pooled(key, || {
@@ -290,14 +293,20 @@ impl<'a> Uploader<'a> {
             vertices: self.filled(&label("vertices"), bytemuck::cast_slice(&asset.vertices), wgpu::BufferUsages::VERTEX),
             indices: self.filled(&label("triangles"), bytemuck::cast_slice(&indices), wgpu::BufferUsages::INDEX),
             num_indices: indices.len() as u32,
-            regions,
             edges: self.filled(&label("edges"), bytemuck::cast_slice(&edges), wgpu::BufferUsages::INDEX),
             num_edge_indices: edges.len() as u32,
-            material: self.material(layouts, &asset.name, &asset.material),
+            material: self.material(layouts, &asset.name, &asset.material, &regions),
+            region_stride: self.region_stride(),
+            regions,
         }
     }
 
-    fn material(&mut self, layouts: &Layouts, name: &str, asset: &MaterialAsset) -> wgpu::BindGroup {
+    /// Bytes from one region's block to the next: as close as the device binds them.
+    fn region_stride(&self) -> u32 {
+        self.device.limits().min_uniform_buffer_offset_alignment.max(size_of::<uniforms::Region>() as u32)
+    }
+
+    fn material(&mut self, layouts: &Layouts, name: &str, asset: &MaterialAsset, regions: &[Region]) -> wgpu::BindGroup {
         let block = uniforms::Material {
             base_color: asset.base_color,
             normal_scale: asset.normal_scale,
@@ -318,6 +327,14 @@ impl<'a> Uploader<'a> {
         let normal = view("normal", &asset.normal, Texels::Slopes, &[128; 2]);
         let surface = view("surface", &asset.surface_map, Texels::Linear2, &[255; 2]);
         let sampler = self.map_sampler(&label("sampler"));
+        let stride = self.region_stride() as usize;
+        let mut blocks = vec![0; stride * regions.len().max(1)];
+        for (bytes, region) in blocks.chunks_exact_mut(stride).zip(regions) {
+            let block = uniforms::Region { poses: region.poses.into(), padding: [0; 3] };
+            bytes[..size_of_val(&block)].copy_from_slice(bytemuck::bytes_of(&block));
+        }
+        let blocks = self.filled(&label("regions"), &blocks, wgpu::BufferUsages::UNIFORM);
+        let region = wgpu::BufferBinding { buffer: &blocks, offset: 0, size: wgpu::BufferSize::new(size_of::<uniforms::Region>() as u64) };
         self.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some(name),
             layout: &layouts.material,
@@ -327,6 +344,7 @@ impl<'a> Uploader<'a> {
                 entry(2, wgpu::BindingResource::TextureView(&normal)),
                 entry(3, wgpu::BindingResource::TextureView(&surface)),
                 entry(4, wgpu::BindingResource::Sampler(&sampler)),
+                entry(5, wgpu::BindingResource::Buffer(region)),
             ],
         })
     }
@@ -374,13 +392,11 @@ pub fn entry(binding: u32, resource: wgpu::BindingResource<'_>) -> wgpu::BindGro
 
 /// Each edge of the triangles once.
 fn edges(indices: &[u32]) -> Vec<u32> {
-    let mut known = BTreeSet::new();
-    for &[a, b, c] in indices.as_chunks::<3>().0 {
-        for (a, b) in [(a, b), (b, c), (c, a)] {
-            known.insert((a.min(b), a.max(b)));
-        }
-    }
-    known.into_iter().flat_map(|(a, b)| [a, b]).collect()
+    let triangles = indices.as_chunks::<3>().0.iter();
+    let mut edges: Vec<[u32; 2]> = triangles.flat_map(|&[a, b, c]| [(a, b), (b, c), (c, a)].map(|(a, b)| [a.min(b), a.max(b)])).collect();
+    edges.sort_unstable();
+    edges.dedup();
+    edges.into_flattened()
 }
 
 #[cfg(test)]

@@ -163,8 +163,7 @@ impl GpuWindow {
 
     /// Draws another character from now on.
     pub(super) fn change_character(&mut self, asset: &CharacterAsset) {
-        // The old one goes after the new one has come, so that maps which both have stay.
-        self.renderer = Renderer::new(&self.device, &self.queue, &self.pool, asset, FACE_FORMAT);
+        self.renderer.change_character(&self.device, &self.queue, &self.pool, asset);
     }
 
     /// What draws.

@@ -132,11 +132,32 @@ impl Canvas {
         self.config.height
     }
 
+    /// Draws `asset` from now on.
     pub fn upload(&mut self, asset: &CharacterAsset) {
-        // The old character's memory first, but for the maps, which the new one may have as well.
-        let kept = self.renderer.take().map(Renderer::into_maps);
-        self.renderer = Some(Renderer::new(&self.device, &self.queue, &self.pool, asset, self.view_format));
-        drop(kept);
+        match &mut self.renderer {
+            Some(renderer) => renderer.change_character(&self.device, &self.queue, &self.pool, asset),
+            None => self.renderer = Some(Renderer::new(&self.device, &self.queue, &self.pool, asset, self.view_format)),
+        }
+    }
+
+    /// Draws a small picture that nobody sees: a browser compiles what draws while the page goes on, and only once it is used.
+    pub fn rehearse(&mut self, settings: &DrawSettings, frame: &RenderFrame) {
+        let Some(renderer) = &mut self.renderer else { return };
+        let side = 16;
+        let picture = self.device.create_texture(&wgpu::TextureDescriptor {
+            label: Some("rehearsal"),
+            size: wgpu::Extent3d { width: side, height: side, depth_or_array_layers: 1 },
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format: self.view_format,
+            usage: wgpu::TextureUsages::RENDER_ATTACHMENT,
+            view_formats: &[],
+        });
+        let view = picture.create_view(&wgpu::TextureViewDescriptor::default());
+        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("rehearsal") });
+        renderer.draw(&self.device, &self.queue, &mut encoder, &view, [side; 2], settings, frame, None);
+        self.queue.submit([encoder.finish()]);
     }
 
     pub fn resize(&mut self, width: u32, height: u32) {

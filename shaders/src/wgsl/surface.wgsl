@@ -16,8 +16,14 @@ struct Material {
     has_intensity: f32,
 }
 
-// Poses that can wrinkle what is drawn, one bit each; the maps of the others are not read.
+// Poses whose maps the code can read, one bit each.
 override POSES: u32 = 255u;
+
+// What the triangles of a draw call have in common.
+struct Region {
+    // Poses that can wrinkle them, one bit each; the maps of the others are not read. WebGL2 binds no fewer than 16 bytes.
+    @size(16) poses: u32,
+}
 
 @group(1) @binding(3) var wrinkle_maps: texture_2d_array<f32>;
 @group(1) @binding(4) var wrinkle_sampler: sampler;
@@ -48,6 +54,7 @@ struct WrinkleWeights {
 // Red: ambient occlusion. Green: roughness. Blue: strength of highlights, see the material.
 @group(2) @binding(3) var surface_map: texture_2d<f32>;
 @group(2) @binding(4) var map_sampler: sampler;
+@group(2) @binding(5) var<uniform> region: Region;
 
 struct Varyings {
     // Invariant: neighbouring regions of the face are drawn by different pipelines and must meet.
@@ -137,8 +144,8 @@ fn zone_slope(uv: vec2<f32>) -> vec2<f32> {
 fn wrinkled_normal(in: Varyings) -> vec3<f32> {
     var blend = begin_blend(base_slope(in.uv));
     for (var pose = 0u; pose < NUM_POSES; pose += 1u) {
-        // The same all over the picture: a device skips what it need not read.
-        if ((POSES & wrinkle_weights.active_poses) & (1u << pose)) == 0u {
+        // The same all over the region: a device skips what it need not read.
+        if ((POSES & region.poses & wrinkle_weights.active_poses) & (1u << pose)) == 0u {
             continue;
         }
         let map = slope_of(textureSample(wrinkle_maps, wrinkle_sampler, in.uv, pose).xy, pose_table.scales[pose / 4u][pose % 4u]);

@@ -295,6 +295,8 @@ const BASE_SCALE: f32 = 0.55;
 const MASK: u8 = 0b1101_0110;
 /// A pose that reaches it as well but does not show in the frame.
 const IDLE: u8 = 0b0000_0001;
+/// A pose that shows in the frame but whose maps the code leaves out.
+const LEFT_OUT: u8 = 0b0010_0000;
 
 /// Eight maps of noise, each with a scale of its own, and the neutral one under them, read at the middles of texels.
 fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
@@ -338,10 +340,11 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
     use wgpu::TextureViewDimension::{D2, D2Array};
     let (base_view, layers_view) = (view(std::slice::from_ref(&base_map), D2), view(&layers, D2Array));
     let weights = uniforms::WrinkleWeights { active_poses: u32::from(!IDLE), ..bytemuck::Zeroable::zeroed() };
+    let region = uniforms::Region { poses: u32::from(MASK | IDLE | LEFT_OUT), ..bytemuck::Zeroable::zeroed() };
     let probe = Probe {
         source: &format!("{}{PLACE}{FRAGMENT_PROBE}", rhytid_shaders::SURFACE),
         entries: ["vs_probe", "fs_probe"],
-        constants: &[("NUM_POSES", MAX_POSES as f64), ("BLEND", number_of(mode)? as f64), ("POSES", f64::from(MASK | IDLE))],
+        constants: &[("NUM_POSES", MAX_POSES as f64), ("BLEND", number_of(mode)? as f64), ("POSES", f64::from(!LEFT_OUT))],
         groups: &[
             (
                 1,
@@ -362,6 +365,7 @@ fn wrinkled_normal(stage: &Stage, mode: BlendMode) -> anyhow::Result<()> {
                     (0, Resource::Block(bytemuck::bytes_of(&material))),
                     (2, Resource::Texture { view: &base_view, dimension: D2, is_filterable: true }),
                     (4, Resource::Sampler),
+                    (5, Resource::Block(bytemuck::bytes_of(&region))),
                 ],
             ),
         ],

@@ -70,6 +70,7 @@ fn blended(stage: &Stage, blend: ZoneBlend) -> anyhow::Result<()> {
     let difference_view = view(std::slice::from_ref(&difference), Rgba8Unorm, D2);
     let material = uniforms::Material { normal_scale: BASE_SCALE, ..bytemuck::Zeroable::zeroed() };
     let table: uniforms::PoseTable = bytemuck::Zeroable::zeroed();
+    let region: uniforms::Region = bytemuck::Zeroable::zeroed();
     let number = ZoneBlend::ALL.iter().position(|known| *known == blend).unwrap_or_default() + 1;
     let read = |number: usize| {
         let read = |view, dimension| Resource::Texture { view, dimension, is_filterable: true };
@@ -90,7 +91,15 @@ fn blended(stage: &Stage, blend: ZoneBlend) -> anyhow::Result<()> {
                         (10, Resource::Block(bytemuck::bytes_of(&block))),
                     ],
                 ),
-                (2, &[(0, Resource::Block(bytemuck::bytes_of(&material))), (2, read(&base_view, D2)), (4, Resource::Sampler)]),
+                (
+                    2,
+                    &[
+                        (0, Resource::Block(bytemuck::bytes_of(&material))),
+                        (2, read(&base_view, D2)),
+                        (4, Resource::Sampler),
+                        (5, Resource::Block(bytemuck::bytes_of(&region))),
+                    ],
+                ),
             ],
             what: What::Points {
                 layout: wgpu::VertexBufferLayout {
