@@ -143,11 +143,9 @@ pub(super) async fn replay(State(hub): State<Arc<Hub>>, Path(room): Path<String>
         Ok(request) => request,
         Err(error) => return bad(error.to_string()),
     };
-    // Opening a recording reads its index.
-    let play = move || hub.players.request(&hub, &room, request, &|recorded| pass.allows(Role::View, recorded));
-    match tokio::task::spawn_blocking(play).await {
-        Ok(Ok(status)) => axum::Json(serde_json::json!({ "replay": status })).into_response(),
-        Ok(Err(error)) => {
+    match hub.players.request(&hub, &room, request, |recorded| pass.allows(Role::View, recorded)).await {
+        Ok(status) => axum::Json(serde_json::json!({ "replay": status })).into_response(),
+        Err(error) => {
             let (code, status) = match error {
                 PlayError::Read(_) => ("bad_recording", StatusCode::UNPROCESSABLE_ENTITY),
                 PlayError::Character { .. } => ("other_character", StatusCode::CONFLICT),
@@ -157,11 +155,12 @@ pub(super) async fn replay(State(hub): State<Arc<Hub>>, Path(room): Path<String>
                 PlayError::Forbidden => ("token_room", StatusCode::FORBIDDEN),
                 PlayError::Range { .. } => ("bad_replay", StatusCode::BAD_REQUEST),
                 PlayError::TooMany => ("too_many_players", StatusCode::SERVICE_UNAVAILABLE),
-                PlayError::Room(_) => ("room_taken", StatusCode::CONFLICT),
+                PlayError::Thread(_) => ("no_thread", StatusCode::SERVICE_UNAVAILABLE),
+                PlayError::Room { code: code @ ("room_taken" | "slot_taken" | "room_elsewhere"), .. } => (code, StatusCode::CONFLICT),
+                PlayError::Room { code, .. } => (code, StatusCode::SERVICE_UNAVAILABLE),
             };
             ErrorMessage::new(code, error.to_string()).response(status)
         }
-        Err(_) => ErrorMessage::new("bad_recording", "it could not be read").response(StatusCode::INTERNAL_SERVER_ERROR),
     }
 }
 

@@ -7,7 +7,7 @@ use super::reader::{ReadError, Recording};
 use super::writer::Item;
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
-use rhytid_shared::RoomName;
+use rhytid_shared::{PublishHello, RoomName};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -116,9 +116,23 @@ pub enum PlayError {
     /// There are too many.
     #[error("the server plays {MOST_PLAYERS} recordings already, which is its limit")]
     TooMany,
+    /// The machine has no thread for it.
+    #[error("cannot start a thread: {0}")]
+    Thread(String),
     /// The room cannot be had.
-    #[error("{0}")]
-    Room(String),
+    #[error("{problem}")]
+    Room {
+        /// Why, short and stable, as publishers are told it.
+        code: &'static str,
+        /// The same in words.
+        problem: String,
+    },
+}
+
+impl From<RoomError> for PlayError {
+    fn from(error: RoomError) -> Self {
+        Self::Room { code: error.code(), problem: error.to_string() }
+    }
 }
 
 impl PlayRequest {
@@ -153,18 +167,18 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Players {
-    /// Does what `request` says in `room`. May read a file, which is played where `may_watch` says so of the room it was made of.
-    pub fn request(
+    /// Does what `request` says in `room`. A file is played where `may_watch` says so of the room it was made of.
+    pub async fn request(
         &self,
         hub: &Arc<Hub>,
         room: &RoomName,
         request: PlayRequest,
-        may_watch: &dyn Fn(&RoomName) -> bool,
+        may_watch: impl Fn(&RoomName) -> bool,
     ) -> Result<PlayStatus, PlayError> {
         request.check()?;
         if let Some(file) = &request.file {
             let path = path_of(hub.recorder.dir(), file)?;
-            return self.start(hub, room, &path, request, may_watch);
+            return self.start(hub, room, path, request, may_watch).await;
         }
         let by_room = lock(&self.by_room);
         let handle = by_room.get(room).filter(|handle| lock(&handle.status).error.is_none()).ok_or(PlayError::NoPlayer)?;
@@ -179,16 +193,19 @@ impl Players {
     }
 
     /// Plays the recording at `path` in `room`, where `may_watch` says so of the room it was made of.
-    pub fn start(
+    pub async fn start(
         &self,
         hub: &Arc<Hub>,
         room: &RoomName,
-        path: &Path,
+        path: PathBuf,
         request: PlayRequest,
-        may_watch: &dyn Fn(&RoomName) -> bool,
+        may_watch: impl Fn(&RoomName) -> bool,
     ) -> Result<PlayStatus, PlayError> {
         request.check()?;
-        let recording = Recording::open(path)?;
+        let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        // Opening a recording reads its index.
+        let opened = tokio::task::spawn_blocking(move || Recording::open(&path)).await;
+        let recording = opened.map_err(|error| PlayError::Thread(error.to_string()))??;
         if !RoomName::new(recording.room()).is_ok_and(|recorded| may_watch(&recorded)) {
             return Err(PlayError::Forbidden);
         }
@@ -196,6 +213,24 @@ impl Players {
             let (recorded, served) = (recording.character().name.clone(), hub.character.name.clone());
             return Err(PlayError::Character { recorded, served });
         }
+        if let Some(cluster) = &hub.cluster {
+            // Last of all: another node's publisher has to go only for what can be played.
+            let hello = PublishHello { source: source_of(&file), takeover: request.takeover, ..PublishHello::default() };
+            let entered = cluster.enter(&hub.rooms, room, &hello).await;
+            entered.map_err(|error| PlayError::Room { code: error.code(), problem: error.to_string() })?;
+        }
+        self.seat(hub, room, file, recording, &request)
+    }
+
+    /// Starts the thread that plays `recording`, called `file`.
+    fn seat(
+        &self,
+        hub: &Arc<Hub>,
+        room: &RoomName,
+        file: String,
+        recording: Recording,
+        request: &PlayRequest,
+    ) -> Result<PlayStatus, PlayError> {
         let mut by_room = lock(&self.by_room);
         // One of our own in this room makes place; others that have ended are forgotten.
         let replaces = by_room.remove(room).is_some_and(|handle| lock(&handle.status).error.is_none());
@@ -206,7 +241,7 @@ impl Players {
         let seconds = recording.seconds();
         let from = request.from.unwrap_or(0.0).min(seconds);
         let status = PlayStatus {
-            file: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            file,
             position: request.position.unwrap_or(from),
             seconds,
             playing: request.playing.unwrap_or(true),
@@ -216,8 +251,7 @@ impl Players {
             to: request.to.unwrap_or(seconds).clamp(from, seconds),
             error: None,
         };
-        let source = format!("replay of {}", status.file);
-        let place = Seat::take(hub, room, &source, request.takeover || replaces).map_err(|error| PlayError::Room(error.to_string()))?;
+        let place = Seat::take(hub, room, &source_of(&status.file), request.takeover || replaces)?;
         let (requests, inbox) = channel();
         let shared = Arc::new(Mutex::new(status.clone()));
         let handle = Handle { requests, status: shared.clone() };
@@ -232,7 +266,7 @@ impl Players {
             drop(player);
         };
         let thread = std::thread::Builder::new().name("player".into()).spawn(run);
-        thread.map_err(|error| PlayError::Room(format!("cannot start a thread: {error}")))?;
+        thread.map_err(|error| PlayError::Thread(error.to_string()))?;
         let told = lock(&handle.status).clone();
         by_room.insert(room.clone(), handle);
         Ok(told)
@@ -247,6 +281,11 @@ impl Players {
     pub fn stop(&self, room: &RoomName) -> Option<PlayStatus> {
         lock(&self.by_room).remove(room).map(|handle| lock(&handle.status).clone())
     }
+}
+
+/// What a player of `file` calls itself in its room.
+fn source_of(file: &str) -> String {
+    format!("replay of {file}")
 }
 
 /// The recording called `name` in `dir`: a plain name, so that nothing outside can be meant.
@@ -313,7 +352,7 @@ impl<'a> Player<'a> {
         Self {
             hub,
             room: seat.place.room.name.clone(),
-            source: format!("replay of {}", status.file),
+            source: source_of(&status.file),
             shown: faces.frame().clone(),
             faces,
             seat,
