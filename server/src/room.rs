@@ -153,6 +153,10 @@ struct RoomState {
     neutrals: BTreeMap<String, Neutral>,
     /// What keeps its messages, also where that has failed.
     recording: Option<Arc<Sink>>,
+    /// Nobody has asked for that.
+    records_by_itself: bool,
+    /// Session of another node's packets that the recording is in, and how many it has of them.
+    fed_session: Option<(u32, u64)>,
     empty_since: Instant,
     /// This node is the room's home; where there are no others it always is.
     is_home: bool,
@@ -294,6 +298,8 @@ impl Rooms {
                 shown: None,
                 neutrals: BTreeMap::new(),
                 recording: None,
+                records_by_itself: false,
+                fed_session: None,
                 empty_since: Instant::now(),
                 is_home: self.others.is_none(),
                 epoch: 0,
