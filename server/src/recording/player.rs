@@ -251,7 +251,7 @@ impl Players {
             to: request.to.unwrap_or(seconds).clamp(from, seconds),
             error: None,
         };
-        let place = Seat::take(hub, room, &source_of(&status.file), request.takeover || replaces)?;
+        let place = Seat::take(hub, room, &source_of(&status.file), Hold { takeover: request.takeover || replaces, resume: None })?;
         let (requests, inbox) = channel();
         let shared = Arc::new(Mutex::new(status.clone()));
         let handle = Handle { requests, status: shared.clone() };
@@ -305,9 +305,18 @@ struct Seat {
     evicted: Evicted,
 }
 
+/// Whose place a player takes.
+#[derive(Debug, Clone, Copy, Default)]
+struct Hold {
+    /// Anybody's.
+    takeover: bool,
+    /// That of this session, its own before.
+    resume: Option<u32>,
+}
+
 impl Seat {
-    fn take(hub: &Hub, room: &RoomName, source: &str, takeover: bool) -> Result<Self, RoomError> {
-        let claim = SlotClaim { source: source.to_owned(), takeover, ..SlotClaim::default() };
+    fn take(hub: &Hub, room: &RoomName, source: &str, hold: Hold) -> Result<Self, RoomError> {
+        let claim = SlotClaim { source: source.to_owned(), takeover: hold.takeover, resume: hold.resume, ..SlotClaim::default() };
         let recorded = |session| {
             let (slot, source) = (claim.slot.name.clone(), claim.source.clone());
             // Its packets are recorded, and no messages that they could be solved from.
@@ -333,6 +342,7 @@ struct Player<'a> {
     source: String,
     faces: Faces,
     seat: Seat,
+    has_lost_room: bool,
     num_frames: u32,
     status: PlayStatus,
     /// The next face's time; it stands in the reader.
@@ -356,6 +366,7 @@ impl<'a> Player<'a> {
             shown: faces.frame().clone(),
             faces,
             seat,
+            has_lost_room: false,
             num_frames: 0,
             next: None,
             anchor: (status.position, now),
@@ -383,7 +394,7 @@ impl<'a> Player<'a> {
             if *self.hub.shutdown.borrow() {
                 return Ok("the server is shutting down");
             }
-            if self.seat.evicted.try_recv().is_ok() {
+            if self.is_evicted() {
                 return Ok("another publisher has taken the room over");
             }
             if self.status.playing {
@@ -454,16 +465,25 @@ impl<'a> Player<'a> {
 
     /// Begins a session anew, unless another publisher has the room.
     fn renew(&mut self) {
-        if self.seat.evicted.try_recv().is_ok() {
-            // Found again by the loop: nobody evicts a place twice, so it is told to end itself.
-            self.hub.players.stop(&self.room);
+        if self.is_evicted() {
             return;
         }
-        if let Ok(seat) = Seat::take(self.hub, &self.room, &self.source, true) {
-            self.seat = seat;
-            self.num_frames = 0;
-            (self.begun, self.last_micros) = (Instant::now(), None);
+        let resume = Some(self.seat.place.session);
+        match Seat::take(self.hub, &self.room, &self.source, Hold { resume, ..Hold::default() }) {
+            Ok(seat) => {
+                self.seat = seat;
+                self.num_frames = 0;
+                (self.begun, self.last_micros) = (Instant::now(), None);
+            }
+            // Taken in this moment.
+            Err(_) => self.has_lost_room = true,
         }
+    }
+
+    /// True once another publisher has the room. A place is told of that once, so it is kept in mind.
+    fn is_evicted(&mut self) -> bool {
+        self.has_lost_room |= self.seat.evicted.try_recv().is_ok();
+        self.has_lost_room
     }
 
     /// Shows the face at `position`, seconds, and goes on from there.

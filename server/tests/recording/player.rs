@@ -46,6 +46,32 @@ fn a_player_stops_seeks_and_goes_on() {
     wait_until("the room to be free", || served.json("GET", "/api/rooms", "")["rooms"][0]["publisher"].is_null());
 }
 
+/// The one that is replaced learns of it while it jumps to and fro.
+#[test]
+fn a_player_that_is_replaced_leaves_the_room_to_the_new_one() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("demo.mcap"), &character, &hello, &frames);
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none"]);
+    let play = |body: &str| served.json("POST", "/api/rooms/demo/replay", body)["replay"].clone();
+    for round in 0..5 {
+        play(r#"{"file":"demo.mcap"}"#);
+        std::thread::scope(|scope| {
+            for at in 0..40 {
+                scope.spawn(move || play(&format!(r#"{{"position":{}.5}}"#, at % 15)));
+            }
+        });
+        play(r#"{"file":"demo.mcap","loop":true}"#);
+        // By then the first has done all it was told to.
+        std::thread::sleep(std::time::Duration::from_millis(400));
+        let status = &served.json("GET", "/api/rooms/demo/replay", "")["replay"];
+        assert!(status["playing"] == true && status["loop"] == true && status["error"].is_null(), "round {round}: {status}");
+        let room = &served.json("GET", "/api/rooms", "")["rooms"][0];
+        assert!(room["publisher"].is_object(), "round {round}: {room}");
+    }
+}
+
 #[test]
 fn a_recording_is_published_again() {
     let folder = Folder::new();
