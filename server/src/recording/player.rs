@@ -14,7 +14,10 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+use tokio::sync::Semaphore;
 
+/// Recordings that are opened at a time: of one that was not finished, the head of every chunk is read.
+const MOST_OPENING: usize = 2;
 /// Players at a time: each is a thread and a few hundred KB.
 const MOST_PLAYERS: usize = 16;
 /// How often a face that stands still is sent again, so that viewers do not take its sender for gone.
@@ -150,9 +153,15 @@ impl PlayRequest {
 }
 
 /// All players, by room.
-#[derive(Default)]
 pub(crate) struct Players {
     by_room: Mutex<BTreeMap<RoomName, Handle>>,
+    opening: Arc<Semaphore>,
+}
+
+impl Default for Players {
+    fn default() -> Self {
+        Self { by_room: Mutex::default(), opening: Arc::new(Semaphore::new(MOST_OPENING)) }
+    }
 }
 
 /// A player's outer end; dropped, it ends.
@@ -202,9 +211,16 @@ impl Players {
         may_watch: impl Fn(&RoomName) -> bool,
     ) -> Result<PlayStatus, PlayError> {
         request.check()?;
+        self.check_place(room)?;
         let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let permit = self.opening.clone().acquire_owned().await.map_err(|error| PlayError::Thread(error.to_string()))?;
         // Opening a recording reads its index.
-        let opened = tokio::task::spawn_blocking(move || Recording::open(&path)).await;
+        let open = move || {
+            // Until it is done, also where nobody waits for it any more.
+            let _permit = permit;
+            Recording::open(&path)
+        };
+        let opened = tokio::task::spawn_blocking(open).await;
         let recording = opened.map_err(|error| PlayError::Thread(error.to_string()))??;
         if !RoomName::new(recording.room()).is_ok_and(|recorded| may_watch(&recorded)) {
             return Err(PlayError::Forbidden);
@@ -220,6 +236,13 @@ impl Players {
             entered.map_err(|error| PlayError::Room { code: error.code(), problem: error.to_string() })?;
         }
         self.seat(hub, room, file, recording, &request)
+    }
+
+    /// Says so where there are too many already for another one in `room`.
+    fn check_place(&self, room: &RoomName) -> Result<(), PlayError> {
+        let by_room = lock(&self.by_room);
+        let others = by_room.iter().filter(|(name, handle)| *name != room && lock(&handle.status).error.is_none()).count();
+        if others >= MOST_PLAYERS { Err(PlayError::TooMany) } else { Ok(()) }
     }
 
     /// Starts the thread that plays `recording`, called `file`.
