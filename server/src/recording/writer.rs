@@ -8,7 +8,6 @@
 //! stopped machine what came since the last `fdatasync`, every [`SYNC`].
 
 use super::format::{Entry, PROFILE, SessionEvent, Topic, VERSION};
-use super::reader::{ReadError, Recording};
 use crate::metrics::Metrics;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
@@ -228,24 +227,24 @@ impl Recorder {
                     Err(told)
                 }
             };
-            // What still comes is let go, and the room told.
+            // What still comes is let go.
             drop(items);
             let file = lock(&shared.file).clone();
             match &ended {
                 Ok(()) => tracing::info!(file, "recording ended"),
                 Err(error) => {
-                    // On a full disk every publisher would leave an empty file.
-                    let path = folder.join(&file);
-                    if !file.is_empty() && matches!(Recording::open(&path), Err(ReadError::Broken { .. })) {
-                        let _ = std::fs::remove_file(&path);
-                    }
                     metrics.recording_failures.inc();
                     tracing::error!(file, error, "recording failed; the stream goes on");
                 }
             }
+            let has_failed = ended.is_err();
             // Before the room is told, so that another may begin at once.
             drop(place);
             *lock(&shared.end) = Some(ended.err().unwrap_or_default());
+            // On a full disk every publisher would leave a file of which nothing can be read. This is known without reading it.
+            if has_failed && !file.is_empty() && shared.bytes.load(Ordering::Relaxed) == 0 {
+                let _ = std::fs::remove_file(folder.join(&file));
+            }
             drop(keeps);
         };
         let thread = std::thread::Builder::new().name("recording".into());
@@ -331,6 +330,7 @@ fn nanos(duration: Duration) -> u64 {
 #[derive(Default)]
 struct Shared {
     waiting_bytes: AtomicUsize,
+    /// Written; nothing as long as no chunk is.
     bytes: AtomicU64,
     /// Left out since the thread was last told.
     gap: AtomicU64,
@@ -681,6 +681,7 @@ fn schema_name(topic: &Topic) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::reader::Recording;
     use super::*;
 
     #[test]

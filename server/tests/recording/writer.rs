@@ -5,6 +5,7 @@ use crate::http::ask;
 use crate::process::{Process, program};
 use crate::server::{Folder, Recorder, run, says, wait_until};
 use rhytid_server::recording::{Faces, Recording, recover};
+use std::fs::OpenOptions;
 use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -127,4 +128,29 @@ fn a_full_disk_ends_the_recording_and_not_the_stream() {
     assert!(files.iter().all(|file| std::fs::metadata(file).unwrap().len() > 0), "{files:?}");
     let report = recover(&files[0], None).unwrap();
     assert!(report.packets > 20, "{report:?}");
+}
+
+/// What stands in a file is no reason to remove it, and is not looked at: reading it could take minutes.
+#[test]
+fn a_failed_recording_is_kept_whatever_stands_in_it_unless_nothing_does() {
+    let folder = Folder::new();
+    let limited = ["sh", "-c", r#"ulimit -f 64; exec "$0" "$@""#];
+    let served = Recorder::try_start(&limited, &["serve", "--record", folder.shown()]).unwrap();
+    let sending = served.keep_sending("4.0");
+    let length = |path: &PathBuf| std::fs::metadata(path).map_or(0, |about| about.len());
+    wait_until("chunks", || folder.files().iter().any(|file| length(file) > 4000));
+    let file = folder.files().remove(0);
+    // As if the disk had lost a byte.
+    std::os::unix::fs::FileExt::write_at(&OpenOptions::new().write(true).open(&file).unwrap(), b"?", 0).unwrap();
+    wait_until("the failure", || served.metric("rhytid_recording_failures_total") >= 1.0);
+    drop(sending);
+    drop(served);
+    assert!(length(&file) > 4000, "it is still there");
+    // Nothing at all fits.
+    let folder = Folder::new();
+    let limited = ["sh", "-c", r#"ulimit -f 0; exec "$0" "$@""#];
+    let served = Recorder::try_start(&limited, &["serve", "--record", folder.shown()]).unwrap();
+    let _sending = served.keep_sending("1.0");
+    wait_until("the failure", || served.metric("rhytid_recording_failures_total") >= 1.0);
+    wait_until("an empty folder", || folder.files().is_empty());
 }
