@@ -4,7 +4,7 @@
 use super::faces::{Faces, Moment};
 use super::format::SessionEvent;
 use super::reader::{ReadError, Recording};
-use super::writer::Item;
+use super::writer::{Item, room_of_file};
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
 use rhytid_shared::{PublishHello, RoomName};
@@ -97,15 +97,12 @@ pub enum PlayError {
     /// The server was started without a folder of recordings.
     #[error("this server keeps no recordings; start it with --record DIR")]
     NoFolder,
-    /// The name is none of a recording.
+    /// The name is none of a recording, or of one of a room that whoever asks may not watch: which of the two, nobody learns.
     #[error("field file is {got:?}, expected the name of a recording in the server's folder")]
     File {
         /// The name.
         got: String,
     },
-    /// It is of a room that whoever asks may not watch. It is not said of which.
-    #[error("the recording is of another room than the token is for")]
-    Forbidden,
     /// A number outside its range.
     #[error("field {field} is {got}, expected {expected}")]
     Range {
@@ -130,6 +127,12 @@ pub enum PlayError {
         /// The same in words.
         problem: String,
     },
+}
+
+impl PlayError {
+    fn no_file(name: &str) -> Self {
+        Self::File { got: name.chars().take(80).collect() }
+    }
 }
 
 impl From<RoomError> for PlayError {
@@ -176,13 +179,13 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Players {
-    /// Does what `request` says in `room`. A file is played where `may_watch` says so of the room it was made of.
+    /// Does what `request` says in `room`. A file is played as by [`Self::start`].
     pub async fn request(
         &self,
         hub: &Arc<Hub>,
         room: &RoomName,
         request: PlayRequest,
-        may_watch: impl Fn(&RoomName) -> bool,
+        may_watch: impl Fn(Option<&RoomName>) -> bool,
     ) -> Result<PlayStatus, PlayError> {
         request.check()?;
         if let Some(file) = &request.file {
@@ -201,30 +204,38 @@ impl Players {
         Ok(status)
     }
 
-    /// Plays the recording at `path` in `room`, where `may_watch` says so of the room it was made of.
+    /// Plays the recording at `path` in `room`, where `may_watch` says so of the room it was made of; of one whose room is not known,
+    /// where it says so of none.
     pub async fn start(
         &self,
         hub: &Arc<Hub>,
         room: &RoomName,
         path: PathBuf,
         request: PlayRequest,
-        may_watch: impl Fn(&RoomName) -> bool,
+        may_watch: impl Fn(Option<&RoomName>) -> bool,
     ) -> Result<PlayStatus, PlayError> {
         request.check()?;
         self.check_place(room)?;
         let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let permit = self.opening.clone().acquire_owned().await.map_err(|error| PlayError::Thread(error.to_string()))?;
         // Opening a recording reads its index.
+        let name = file.clone();
         let open = move || {
             // Until it is done, also where nobody waits for it any more.
             let _permit = permit;
-            Recording::open(&path)
+            // Where the server keeps it is nobody's business.
+            Recording::open_as(&path, name)
         };
-        let opened = tokio::task::spawn_blocking(open).await;
-        let recording = opened.map_err(|error| PlayError::Thread(error.to_string()))??;
-        if !RoomName::new(recording.room()).is_ok_and(|recorded| may_watch(&recorded)) {
-            return Err(PlayError::Forbidden);
+        let opened = tokio::task::spawn_blocking(open).await.map_err(|error| PlayError::Thread(error.to_string()))?;
+        let recorded = match &opened {
+            Ok(recording) => RoomName::new(recording.room()).ok(),
+            // Its name says whose it is.
+            Err(_) => room_of_file(&file),
+        };
+        if !may_watch(recorded.as_ref()) {
+            return Err(PlayError::no_file(&file));
         }
+        let recording = opened?;
         if recording.character().sha256 != hub.character.sha256 {
             let (recorded, served) = (recording.character().name.clone(), hub.character.name.clone());
             return Err(PlayError::Character { recorded, served });
@@ -319,7 +330,7 @@ fn path_of(dir: Option<&Path>, name: &str) -> Result<PathBuf, PlayError> {
         && !name.starts_with('.')
         && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'_'));
     let path = dir.join(name);
-    if is_plain && path.is_file() { Ok(path) } else { Err(PlayError::File { got: name.chars().take(80).collect() }) }
+    if is_plain && path.is_file() { Ok(path) } else { Err(PlayError::no_file(name)) }
 }
 
 /// The player's place in its room, for one session.

@@ -81,7 +81,11 @@ pub struct Recording {
 impl Recording {
     /// Opens a file and reads its index; of a file that was not finished, what stands in it whole.
     pub fn open(path: &Path) -> Result<Self, ReadError> {
-        let shown = path.display().to_string();
+        Self::open_as(path, path.display().to_string())
+    }
+
+    /// The same of a file that is called `shown` in errors.
+    pub(super) fn open_as(path: &Path, shown: String) -> Result<Self, ReadError> {
         let io = |source| ReadError::Io { path: shown.clone(), source };
         let file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();

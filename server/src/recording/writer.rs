@@ -301,6 +301,21 @@ fn create(dir: &Path, room: &RoomName) -> Result<(File, PathBuf), RecordError> {
     Err(RecordError::Create { path: dir.join(format!("{room}-{time}.mcap")).display().to_string(), source })
 }
 
+/// The room that the name of a recording says, where it is one that [`create`] gives.
+pub(crate) fn room_of_file(name: &str) -> Option<RoomName> {
+    let name = name.strip_suffix(".mcap")?;
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let name = name.rsplit_once('-').filter(|(_, number)| is_number(number)).map_or(name, |(name, _)| name);
+    let (room, stamp) = name.rsplit_once('-')?;
+    let is_stamp = stamp.len() == "20260131T235959Z".len()
+        && stamp.bytes().enumerate().all(|(at, byte)| match at {
+            8 => byte == b'T',
+            15 => byte == b'Z',
+            _ => byte.is_ascii_digit(),
+        });
+    if is_stamp { RoomName::new(room).ok() } else { None }
+}
+
 /// `20260131T235959Z`.
 fn stamp(time: SystemTime) -> String {
     let seconds = time.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
@@ -752,6 +767,18 @@ mod tests {
         }
         assert!(text.contains(r#"{"event":"gap","messages":7}"#) && text.contains(r#"{"event":"stop","reason":"the file has"#), "{text}");
         std::fs::remove_dir_all(&dir).unwrap();
+    }
+
+    #[test]
+    fn recordings_are_told_by_room_though_names_begin_alike() {
+        let room = |file: &str| room_of_file(file).map(|room| room.to_string());
+        assert_eq!(room("a-20260131T235959Z.mcap").as_deref(), Some("a"));
+        assert_eq!(room("a-20260131T235959Z-12.mcap").as_deref(), Some("a"));
+        assert_eq!(room("a-b-20260131T235959Z.mcap").as_deref(), Some("a-b"));
+        assert_eq!(room("a-20260131T235959Z-20260131T235959Z.mcap").as_deref(), Some("a-20260131T235959Z"));
+        for file in ["a-.mcap", "a-20260131T235959Z-.mcap", "b.mcap", "-20260131T235959Z.mcap", "a-20260131T235959Z", "a-2.mcap"] {
+            assert_eq!(room(file), None, "{file}");
+        }
     }
 
     #[test]
