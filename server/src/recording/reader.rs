@@ -181,6 +181,11 @@ impl Recording {
         &self.chunks
     }
 
+    /// Length of the file when it was opened, bytes.
+    pub(super) fn num_bytes(&self) -> u64 {
+        self.source.length
+    }
+
     /// Bytes that make no whole chunk at the end of a file that was not finished; nothing for one that was.
     pub fn cut_off(&self) -> Option<u64> {
         self.cut_at.map(|end| self.source.length - end)

@@ -1,7 +1,7 @@
 //! Recording as a viewer: the packets of a room on any server, without what its publisher sent.
 
 use super::format::{SessionEvent, VERSION};
-use super::writer::{RecordError, RecordingWriter};
+use super::writer::{RecordError, RecordingWriter, hold};
 use crate::send::{SendError, connect};
 use futures_util::StreamExt;
 use mcap::McapError;
@@ -81,6 +81,7 @@ pub async fn watch(
     let layout = PacketLayout::try_from(&hello.character).map_err(|error| failed(error.to_string()))?;
     let write_error = |error: &dyn std::fmt::Display| WatchError::File { path: out.display().to_string(), problem: error.to_string() };
     let file = OpenOptions::new().write(true).create_new(true).open(out).map_err(|error| write_error(&error))?;
+    hold(&file);
     let mut writer: RecordingWriter<File> = RecordingWriter::to(file, layout).map_err(|error: RecordError| write_error(&error))?;
     let now = || SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
     let begin = SessionEvent::Recording {

@@ -292,13 +292,28 @@ fn create(dir: &Path, room: &RoomName) -> Result<(File, PathBuf), RecordError> {
         let suffix = if attempt == 1 { String::new() } else { format!("-{attempt}") };
         let path = dir.join(format!("{room}-{time}{suffix}.mcap"));
         match OpenOptions::new().write(true).create_new(true).open(&path) {
-            Ok(file) => return Ok((file, path)),
+            Ok(file) => {
+                hold(&file);
+                return Ok((file, path));
+            }
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
             Err(source) => return Err(RecordError::Create { path: path.display().to_string(), source }),
         }
     }
     let source = io::ErrorKind::AlreadyExists.into();
     Err(RecordError::Create { path: dir.join(format!("{room}-{time}.mcap")).display().to_string(), source })
+}
+
+/// Marks a recording's file as its holder's for as long as it is open there, also in clones of it; false where another holds it.
+/// Whoever only reads is not hindered: elsewhere than on Unix a mark would do that, so there is none.
+pub(super) fn hold(file: &File) -> bool {
+    #[cfg(unix)]
+    return !matches!(file.try_lock(), Err(std::fs::TryLockError::WouldBlock));
+    #[cfg(not(unix))]
+    {
+        let _ = file;
+        true
+    }
 }
 
 /// The room that the name of a recording says, where it is one that [`create`] gives.

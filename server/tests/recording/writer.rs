@@ -154,3 +154,31 @@ fn a_failed_recording_is_kept_whatever_stands_in_it_unless_nothing_does() {
     wait_until("the failure", || served.metric("rhytid_recording_failures_total") >= 1.0);
     wait_until("an empty folder", || folder.files().is_empty());
 }
+
+#[test]
+fn a_recording_is_not_mended_while_it_is_written_and_a_killed_mending_may_be_done_again() {
+    let folder = Folder::new();
+    let served = Recorder::into(&folder);
+    let sending = served.keep_sending("1.0");
+    wait_until("frames", || served.metric("rhytid_frames_in_total") > 40.0);
+    let path = folder.recording();
+    let shown = path.to_str().unwrap();
+    let refused = run(&["recover", shown]);
+    assert!(!refused.status.success() && says(&refused).contains("is still being written"), "{}", says(&refused));
+    let copy = folder.path("copy");
+    let copied = run(&["recover", shown, "--out", copy.to_str().unwrap()]);
+    assert!(copied.status.success(), "what stands in it so far may be had: {}", says(&copied));
+    let before = served.metric("rhytid_recorded_bytes_total");
+    wait_until("more of it", || served.metric("rhytid_recorded_bytes_total") > before + 1000.0);
+    assert!(std::fs::metadata(&path).unwrap().len() as f64 > before, "it is the file that is written");
+    drop(served);
+    drop(sending);
+    // A mending that was killed has left this.
+    let left = folder.path(&format!("{}.mended", path.file_name().unwrap().to_str().unwrap()));
+    std::fs::write(&left, vec![7; 100_000]).unwrap();
+    let mended = run(&["recover", shown]);
+    assert!(mended.status.success() && says(&mended).contains("kept "), "{}", says(&mended));
+    assert!(!left.exists());
+    let verified = run(&["verify", shown]);
+    assert!(verified.status.success(), "{}", says(&verified));
+}
