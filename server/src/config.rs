@@ -200,11 +200,14 @@ pub struct Timeouts {
     /// That a room stays without publisher and viewers.
     #[arg(id = "room-timeout", long = "room-timeout", default_value_t = Self::default().room_idle, value_name = "SECONDS")]
     pub room_idle: f64,
+    /// That a replay stands still, stopped or at its end, before it leaves its room; one that the server was started with stays.
+    #[arg(id = "replay-timeout", long = "replay-timeout", default_value_t = Self::default().replay_idle, value_name = "SECONDS")]
+    pub replay_idle: f64,
 }
 
 impl Default for Timeouts {
     fn default() -> Self {
-        Self { hello: 10.0, ping: 5.0, publisher_idle: 15.0, viewer_idle: 90.0, write: 75.0, room_idle: 60.0 }
+        Self { hello: 10.0, ping: 5.0, publisher_idle: 15.0, viewer_idle: 90.0, write: 75.0, room_idle: 60.0, replay_idle: 600.0 }
     }
 }
 
@@ -330,6 +333,7 @@ impl ServerConfig {
             ("timeouts.viewer_idle", timeouts.viewer_idle),
             ("timeouts.write", timeouts.write),
             ("timeouts.room_idle", timeouts.room_idle),
+            ("timeouts.replay_idle", timeouts.replay_idle),
         ] {
             if !(0.01..=86_400.0).contains(&got) {
                 return Err(ServerConfigError::Range { field, got: got.to_string(), expected: "0.01 to 86400 seconds" });

@@ -333,6 +333,7 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "viewer-timeout": timeouts.viewer_idle,
         "write-timeout": timeouts.write,
         "room-timeout": timeouts.room_idle,
+        "replay-timeout": timeouts.replay_idle,
         "record": record.dir,
         "record-rooms": record.rooms,
         "max-recordings": record.recordings,

@@ -100,12 +100,15 @@ pub(crate) struct SlotClaim {
     pub takeover: bool,
     /// Take it over from this session, which was the claimant's own.
     pub resume: Option<u32>,
+    /// It plays a recording: no other one is made of that unless somebody asks for it.
+    pub is_replay: bool,
 }
 
 impl SlotClaim {
     /// As a hello says it.
     pub fn of(hello: &PublishHello) -> Self {
-        Self { slot: hello.slot.clone(), source: hello.source.clone(), takeover: hello.takeover, resume: hello.resume }
+        let PublishHello { slot, source, takeover, resume, .. } = hello;
+        Self { slot: slot.clone(), source: source.clone(), takeover: *takeover, resume: *resume, is_replay: false }
     }
 }
 
@@ -242,7 +245,7 @@ impl Rooms {
             None if state.publishers.len() >= MAX_SLOTS => return Err(RoomError::TooManySlots { most: MAX_SLOTS }),
             _ => {}
         }
-        if self.recorder.is_automatic(name) && !state.is_recorded() {
+        if !claim.is_replay && self.recorder.is_automatic(name) && !state.is_recorded() {
             self.record_by_itself(&room, &mut state);
         }
         let (evict, evicted) = oneshot::channel();

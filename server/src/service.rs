@@ -248,7 +248,7 @@ pub async fn run(
         cluster.wait().await;
     }
     if let Some(Play { file, room, request }) = hub.config.play.clone() {
-        hub.players.start(&hub, &room, file, request, |_| true).await.map_err(ServerError::Play)?;
+        hub.players.start(&hub, &room, file, request, None, |_| true).await.map_err(ServerError::Play)?;
     }
     listen::start(&hub, ports);
     vmc_out::start(&hub, outs);

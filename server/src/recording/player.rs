@@ -5,6 +5,7 @@ use super::faces::{Faces, Moment};
 use super::format::SessionEvent;
 use super::reader::{ReadError, Recording};
 use super::writer::{Item, room_of_file};
+use crate::config::seconds;
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
 use rhytid_shared::{PublishHello, RoomName};
@@ -190,7 +191,8 @@ impl Players {
         request.check()?;
         if let Some(file) = &request.file {
             let path = path_of(hub.recorder.dir(), file)?;
-            return self.start(hub, room, path, request, may_watch).await;
+            let most_standing = Some(seconds(hub.config.timeouts.replay_idle));
+            return self.start(hub, room, path, request, most_standing, may_watch).await;
         }
         let by_room = lock(&self.by_room);
         let handle = by_room.get(room).filter(|handle| lock(&handle.status).error.is_none()).ok_or(PlayError::NoPlayer)?;
@@ -205,13 +207,14 @@ impl Players {
     }
 
     /// Plays the recording at `path` in `room`, where `may_watch` says so of the room it was made of; of one whose room is not known,
-    /// where it says so of none.
+    /// where it says so of none. Ends where it has stood still for `most_standing`.
     pub async fn start(
         &self,
         hub: &Arc<Hub>,
         room: &RoomName,
         path: PathBuf,
         request: PlayRequest,
+        most_standing: Option<Duration>,
         may_watch: impl Fn(Option<&RoomName>) -> bool,
     ) -> Result<PlayStatus, PlayError> {
         request.check()?;
@@ -246,7 +249,7 @@ impl Players {
             let entered = cluster.enter(&hub.rooms, room, &hello).await;
             entered.map_err(|error| PlayError::Room { code: error.code(), problem: error.to_string() })?;
         }
-        self.seat(hub, room, file, recording, &request)
+        self.seat(hub, room, file, recording, &request, most_standing)
     }
 
     /// Says so where there are too many already for another one in `room`.
@@ -264,6 +267,7 @@ impl Players {
         file: String,
         recording: Recording,
         request: &PlayRequest,
+        most_standing: Option<Duration>,
     ) -> Result<PlayStatus, PlayError> {
         let mut by_room = lock(&self.by_room);
         // One of our own in this room makes place; others that have ended are forgotten.
@@ -272,17 +276,17 @@ impl Players {
         if by_room.len() >= MOST_PLAYERS {
             return Err(PlayError::TooMany);
         }
-        let seconds = recording.seconds();
-        let from = request.from.unwrap_or(0.0).min(seconds);
+        let length = recording.seconds();
+        let from = request.from.unwrap_or(0.0).min(length);
         let status = PlayStatus {
             file,
             position: request.position.unwrap_or(from),
-            seconds,
+            seconds: length,
             playing: request.playing.unwrap_or(true),
             speed: request.speed.unwrap_or(1.0),
             repeats: request.repeats.unwrap_or(false),
             from,
-            to: request.to.unwrap_or(seconds).clamp(from, seconds),
+            to: request.to.unwrap_or(length).clamp(from, length),
             error: None,
         };
         let place = Seat::take(hub, room, &source_of(&status.file), Hold { takeover: request.takeover || replaces, resume: None })?;
@@ -291,7 +295,7 @@ impl Players {
         let handle = Handle { requests, status: shared.clone() };
         let hub = hub.clone();
         let run = move || {
-            let mut player = Player::new(&hub, Faces::new(recording), place, status);
+            let mut player = Player::new(&hub, Faces::new(recording), place, status, most_standing);
             let ended = player.run(&inbox, &shared);
             let mut status = lock(&shared);
             status.playing = false;
@@ -350,7 +354,8 @@ struct Hold {
 
 impl Seat {
     fn take(hub: &Hub, room: &RoomName, source: &str, hold: Hold) -> Result<Self, RoomError> {
-        let claim = SlotClaim { source: source.to_owned(), takeover: hold.takeover, resume: hold.resume, ..SlotClaim::default() };
+        let claim =
+            SlotClaim { source: source.to_owned(), takeover: hold.takeover, resume: hold.resume, is_replay: true, ..SlotClaim::default() };
         let recorded = |session| {
             let (slot, source) = (claim.slot.name.clone(), claim.source.clone());
             // Its packets are recorded, and no messages that they could be solved from.
@@ -388,10 +393,13 @@ struct Player<'a> {
     /// When the session began, and its last time, µs.
     begun: Instant,
     last_micros: Option<u64>,
+    /// How long it may stand still, and since when it does, or was last told something.
+    most_standing: Option<Duration>,
+    stands_since: Instant,
 }
 
 impl<'a> Player<'a> {
-    fn new(hub: &'a Hub, faces: Faces, seat: Seat, status: PlayStatus) -> Self {
+    fn new(hub: &'a Hub, faces: Faces, seat: Seat, status: PlayStatus, most_standing: Option<Duration>) -> Self {
         let now = Instant::now();
         Self {
             hub,
@@ -407,6 +415,8 @@ impl<'a> Player<'a> {
             status,
             begun: now,
             last_micros: None,
+            most_standing,
+            stands_since: now,
         }
     }
 
@@ -421,7 +431,10 @@ impl<'a> Player<'a> {
             let wait =
                 due.map_or(HOLD, |due| due.saturating_duration_since(Instant::now())).min(if self.status.playing { LOOK } else { HOLD });
             match inbox.recv_timeout(wait) {
-                Ok(request) => self.obey(&request)?,
+                Ok(request) => {
+                    self.stands_since = Instant::now();
+                    self.obey(&request)?;
+                }
                 Err(RecvTimeoutError::Disconnected) => return Ok("ended"),
                 Err(RecvTimeoutError::Timeout) => {}
             }
@@ -430,6 +443,11 @@ impl<'a> Player<'a> {
             }
             if self.is_evicted() {
                 return Ok("another publisher has taken the room over");
+            }
+            if self.status.playing {
+                self.stands_since = Instant::now();
+            } else if self.most_standing.is_some_and(|most| self.stands_since.elapsed() >= most) {
+                return Ok("it has stood still for too long");
             }
             if self.status.playing {
                 self.play()?;

@@ -73,6 +73,33 @@ fn a_player_that_is_replaced_leaves_the_room_to_the_new_one() {
 }
 
 #[test]
+fn a_replay_that_stands_still_leaves_its_room_and_none_is_recorded_unasked() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("demo.mcap"), &character, &hello, &frames);
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--replay-timeout", "1"]);
+    let status = || served.json("GET", "/api/rooms/demo/replay", "")["replay"].clone();
+    let end = frames.last().unwrap().t;
+    served.json("POST", "/api/rooms/demo/replay", &format!(r#"{{"file":"demo.mcap","from":{}}}"#, end - 2.5));
+    wait_until("its end", || status()["playing"] == false);
+    assert!(status()["error"].is_null(), "it stands: {}", status());
+    assert_eq!(served.metric("rhytid_recordings"), 0.0, "it is a recording already");
+    // Whoever uses it keeps it there.
+    for _ in 0..3 {
+        std::thread::sleep(std::time::Duration::from_millis(600));
+        served.json("POST", "/api/rooms/demo/replay", &format!(r#"{{"position":{},"playing":false}}"#, end - 1.0));
+    }
+    wait_until("the room to be free", || served.json("GET", "/api/rooms", "")["rooms"][0]["publisher"].is_null());
+    assert!(status()["error"].as_str().unwrap().contains("stood still"), "{}", status());
+    assert_eq!(folder.files().len(), 1);
+    // Who asks for it gets it.
+    served.json("POST", "/api/rooms/demo/replay", r#"{"file":"demo.mcap"}"#);
+    served.json("POST", "/api/rooms/demo/record/start", "");
+    assert_eq!(served.metric("rhytid_recordings"), 1.0);
+}
+
+#[test]
 fn a_recording_is_published_again() {
     let folder = Folder::new();
     let first = Recorder::into(&folder);
