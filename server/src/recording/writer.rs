@@ -348,11 +348,11 @@ fn stamp(time: SystemTime) -> String {
 }
 
 /// Of the Unix clock.
-fn unix_nanos() -> u64 {
+pub(super) fn unix_nanos() -> u64 {
     nanos(SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default())
 }
 
-fn nanos(duration: Duration) -> u64 {
+pub(super) fn nanos(duration: Duration) -> u64 {
     u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX / 2)
 }
 
