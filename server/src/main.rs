@@ -327,6 +327,7 @@ async fn serve(args: ServeArgs, matches: Option<&clap::ArgMatches>) -> anyhow::R
         "max-connections": limits.connections_per_address,
         "max-connection-rate": limits.connections_per_second,
         "max-address-fps": limits.frames_per_second_per_address,
+        "max-request-rate": limits.requests_per_second_per_address,
         "hello-timeout": timeouts.hello,
         "ping-interval": timeouts.ping,
         "publisher-timeout": timeouts.publisher_idle,
