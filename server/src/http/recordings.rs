@@ -141,6 +141,7 @@ pub(super) async fn replay(State(hub): State<Arc<Hub>>, Path(room): Path<String>
                 PlayError::File { .. } => ("no_such_recording", StatusCode::NOT_FOUND),
                 PlayError::Range { .. } => ("bad_replay", StatusCode::BAD_REQUEST),
                 PlayError::TooMany => ("too_many_players", StatusCode::SERVICE_UNAVAILABLE),
+                PlayError::Busy => ("player_busy", StatusCode::SERVICE_UNAVAILABLE),
                 PlayError::Thread(_) => ("no_thread", StatusCode::SERVICE_UNAVAILABLE),
                 PlayError::Room { code: code @ ("room_taken" | "slot_taken" | "room_elsewhere"), .. } => (code, StatusCode::CONFLICT),
                 PlayError::Room { code, .. } => (code, StatusCode::SERVICE_UNAVAILABLE),

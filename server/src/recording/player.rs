@@ -12,7 +12,7 @@ use rhytid_shared::{PublishHello, RoomName};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::Semaphore;
@@ -27,6 +27,8 @@ const HOLD: Duration = Duration::from_millis(50);
 const LOOK: Duration = Duration::from_millis(100);
 /// Speeds that make sense; an infinite one sends everything at once.
 const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=100.0;
+/// Requests of one player that may wait for it: each jump takes it some milliseconds.
+const MOST_WAITING: usize = 64;
 /// Frames sent in a row at infinite speed before commands are looked at.
 const BURST: usize = 256;
 
@@ -117,6 +119,9 @@ pub enum PlayError {
     /// There are too many.
     #[error("the server plays {MOST_PLAYERS} recordings already, which is its limit")]
     TooMany,
+    /// It is told more than it can do.
+    #[error("the player has {MOST_WAITING} requests waiting, which is its limit")]
+    Busy,
     /// The machine has no thread for it.
     #[error("cannot start a thread: {0}")]
     Thread(String),
@@ -170,7 +175,7 @@ impl Default for Players {
 
 /// A player's outer end; dropped, it ends.
 struct Handle {
-    requests: Sender<PlayRequest>,
+    requests: SyncSender<PlayRequest>,
     status: Arc<Mutex<PlayStatus>>,
 }
 
@@ -196,7 +201,10 @@ impl Players {
         }
         let by_room = lock(&self.by_room);
         let handle = by_room.get(room).filter(|handle| lock(&handle.status).error.is_none()).ok_or(PlayError::NoPlayer)?;
-        handle.requests.send(request.clone()).map_err(|_| PlayError::NoPlayer)?;
+        handle.requests.try_send(request.clone()).map_err(|error| match error {
+            TrySendError::Full(_) => PlayError::Busy,
+            TrySendError::Disconnected(_) => PlayError::NoPlayer,
+        })?;
         let mut status = lock(&handle.status).clone();
         // As it will be in a moment.
         status.position = request.position.unwrap_or(status.position);
@@ -290,7 +298,7 @@ impl Players {
             error: None,
         };
         let place = Seat::take(hub, room, &source_of(&status.file), Hold { takeover: request.takeover || replaces, resume: None })?;
-        let (requests, inbox) = channel();
+        let (requests, inbox) = sync_channel(MOST_WAITING);
         let shared = Arc::new(Mutex::new(status.clone()));
         let handle = Handle { requests, status: shared.clone() };
         let hub = hub.clone();
