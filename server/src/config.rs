@@ -155,6 +155,10 @@ pub struct Limits {
     /// Messages a second from all publishers of one address; faster ones are slowed down. Does not hold for loopback.
     #[arg(id = "max-address-fps", long = "max-address-fps", default_value_t = Self::default().frames_per_second_per_address, value_name = "N")]
     pub frames_per_second_per_address: u32,
+    /// Requests over HTTP a second from one address, after a burst of four seconds' worth; faster ones are slowed down. Does not hold
+    /// for loopback.
+    #[arg(id = "max-request-rate", long = "max-request-rate", default_value_t = Self::default().requests_per_second_per_address, value_name = "N")]
+    pub requests_per_second_per_address: u32,
 }
 
 impl Default for Limits {
@@ -174,6 +178,8 @@ impl Default for Limits {
             connections_per_second: 16,
             // A studio of sixty faces.
             frames_per_second_per_address: 4000,
+            // A class whose pages all look every second who is there.
+            requests_per_second_per_address: 256,
         }
     }
 }
@@ -200,11 +206,14 @@ pub struct Timeouts {
     /// That a room stays without publisher and viewers.
     #[arg(id = "room-timeout", long = "room-timeout", default_value_t = Self::default().room_idle, value_name = "SECONDS")]
     pub room_idle: f64,
+    /// That a replay stands still, stopped or at its end, before it leaves its room; one that the server was started with stays.
+    #[arg(id = "replay-timeout", long = "replay-timeout", default_value_t = Self::default().replay_idle, value_name = "SECONDS")]
+    pub replay_idle: f64,
 }
 
 impl Default for Timeouts {
     fn default() -> Self {
-        Self { hello: 10.0, ping: 5.0, publisher_idle: 15.0, viewer_idle: 90.0, write: 75.0, room_idle: 60.0 }
+        Self { hello: 10.0, ping: 5.0, publisher_idle: 15.0, viewer_idle: 90.0, write: 75.0, room_idle: 60.0, replay_idle: 600.0 }
     }
 }
 
@@ -291,6 +300,7 @@ impl ServerConfig {
             ("limits.connections_per_address", limits.connections_per_address, 1_000_000),
             ("limits.connections_per_second", limits.connections_per_second as usize, 1_000_000),
             ("limits.frames_per_second_per_address", limits.frames_per_second_per_address as usize, 1_000_000),
+            ("limits.requests_per_second_per_address", limits.requests_per_second_per_address as usize, 1_000_000),
         ] {
             if got == 0 || got > most {
                 return Err(ServerConfigError::Range { field, got: got.to_string(), expected: "1 to 1000000" });
@@ -330,6 +340,7 @@ impl ServerConfig {
             ("timeouts.viewer_idle", timeouts.viewer_idle),
             ("timeouts.write", timeouts.write),
             ("timeouts.room_idle", timeouts.room_idle),
+            ("timeouts.replay_idle", timeouts.replay_idle),
         ] {
             if !(0.01..=86_400.0).contains(&got) {
                 return Err(ServerConfigError::Range { field, got: got.to_string(), expected: "0.01 to 86400 seconds" });

@@ -3,7 +3,7 @@
 
 use crate::config::seconds;
 use crate::http::Pass;
-use crate::publish::until;
+use crate::publish::{Rate, until};
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
 use crate::source::{Control, Told};
@@ -21,6 +21,8 @@ use tokio_tungstenite::tungstenite::{Bytes, Message, Utf8Bytes};
 
 /// Commands of one socket that may wait for their answers.
 const MOST_WAITING: usize = 4;
+/// Messages a second of one socket: more than the commands that any source takes, and pongs.
+const MOST_MESSAGES: u32 = 50;
 /// How much longer than a step of the fit measures its frames may take to come.
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -55,20 +57,28 @@ pub(crate) async fn talk(target: Target, mut socket: Socket, pass: Pass) {
         biased;
         () = stopped(&mut shutdown) => Err(Ending::shutdown().into()),
         () = until(pass.expires) => Err(Ending::token_expired().into()),
-        result = run(&target, &mut socket) => result,
+        result = run(&target, &mut socket, &pass) => result,
     };
     end(socket, stop, &target.hub.metrics).await;
 }
 
-async fn run(target: &Target, socket: &mut Socket) -> Result<Infallible, Stop> {
+async fn run(target: &Target, socket: &mut Socket, pass: &Pass) -> Result<Infallible, Stop> {
     let timeouts = &target.hub.config.timeouts;
     let (ping, idle, write) = (seconds(timeouts.ping), seconds(timeouts.viewer_idle), seconds(timeouts.write));
     let mut waiting = FuturesUnordered::new();
+    let mut messages = Rate::new(MOST_MESSAGES, Instant::now());
     let (mut last_ping, mut last_heard) = (Instant::now(), Instant::now());
     loop {
         let told: Told = tokio::select! {
             message = tokio::time::timeout_at(last_heard + idle, socket.next()) => {
                 last_heard = Instant::now();
+                let limits = &target.hub.config.limits;
+                let by_address = pass.place.as_ref().and_then(|place| place.take_message(last_heard.into_std())).map(Instant::from_std);
+                // As a publisher that is too fast, whether or not there is somebody to command: nothing is read meanwhile.
+                if let Some(until) = messages.take(last_heard).max(by_address) {
+                    last_heard = until;
+                    tokio::time::sleep_until(until).await;
+                }
                 match message {
                     Err(_) => return Err(Ending::error(
                         CloseCode::Policy,
@@ -93,7 +103,7 @@ async fn run(target: &Target, socket: &mut Socket) -> Result<Infallible, Stop> {
                     Ok(Some(Ok(Message::Binary(_)))) => Err(ErrorMessage::new("binary_message", "a control socket takes text, got a binary message")),
                     Ok(Some(Ok(Message::Close(_))) | None) => return Err(Stop::Gone("closed")),
                     Ok(Some(Ok(_))) => continue,
-                    Ok(Some(Err(error))) => return Err(broken(error, target.hub.config.limits.message_bytes)),
+                    Ok(Some(Err(error))) => return Err(broken(error, limits.message_bytes)),
                 }
             }
             Some(told) = waiting.next() => told,

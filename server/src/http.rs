@@ -124,9 +124,9 @@ pub(crate) struct Pass {
 }
 
 impl Pass {
-    /// Whether its bearer may act as `role` in `room` too.
-    fn allows(&self, role: Role, room: &RoomName) -> bool {
-        self.claims.as_ref().is_none_or(|claims| claims.allow(role, Some(room)).is_ok())
+    /// Whether its bearer may act as `role` in `room` too, or in all of them.
+    fn allows(&self, role: Role, room: Option<&RoomName>) -> bool {
+        self.claims.as_ref().is_none_or(|claims| claims.allow(role, room).is_ok())
     }
 }
 

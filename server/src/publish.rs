@@ -315,7 +315,7 @@ impl Rate {
     }
 
     /// Counts one; gives the time before which no other shall be read.
-    fn take(&mut self, now: Instant) -> Option<Instant> {
+    pub fn take(&mut self, now: Instant) -> Option<Instant> {
         let earliest = now.checked_sub(self.burst).unwrap_or(now);
         self.due = self.due.max(earliest) + self.interval;
         (self.due > now).then_some(self.due)

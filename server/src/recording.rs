@@ -28,5 +28,5 @@ pub use reader::{ChunkPlace, ReadError, Recording};
 pub use recover::{RecoverError, RecoverReport, recover};
 pub use verify::{Difference, VerifyError, VerifyReport, verify};
 pub use viewer::{WatchError, watch};
-pub(crate) use writer::{Item, Recorder, RecorderStatus, Sink};
+pub(crate) use writer::{Item, Recorder, RecorderStatus, Sink, room_of_file};
 pub use writer::{RecordConfig, RecordError, RecordingWriter};

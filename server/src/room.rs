@@ -100,12 +100,15 @@ pub(crate) struct SlotClaim {
     pub takeover: bool,
     /// Take it over from this session, which was the claimant's own.
     pub resume: Option<u32>,
+    /// It plays a recording: no other one is made of that unless somebody asks for it.
+    pub is_replay: bool,
 }
 
 impl SlotClaim {
     /// As a hello says it.
     pub fn of(hello: &PublishHello) -> Self {
-        Self { slot: hello.slot.clone(), source: hello.source.clone(), takeover: hello.takeover, resume: hello.resume }
+        let PublishHello { slot, source, takeover, resume, .. } = hello;
+        Self { slot: slot.clone(), source: source.clone(), takeover: *takeover, resume: *resume, is_replay: false }
     }
 }
 
@@ -153,6 +156,10 @@ struct RoomState {
     neutrals: BTreeMap<String, Neutral>,
     /// What keeps its messages, also where that has failed.
     recording: Option<Arc<Sink>>,
+    /// Nobody has asked for that.
+    records_by_itself: bool,
+    /// Session of another node's packets that the recording is in, and how many it has of them.
+    fed_session: Option<(u32, u64)>,
     empty_since: Instant,
     /// This node is the room's home; where there are no others it always is.
     is_home: bool,
@@ -238,7 +245,7 @@ impl Rooms {
             None if state.publishers.len() >= MAX_SLOTS => return Err(RoomError::TooManySlots { most: MAX_SLOTS }),
             _ => {}
         }
-        if self.recorder.is_automatic(name) && !state.is_recorded() {
+        if !claim.is_replay && self.recorder.is_automatic(name) && !state.is_recorded() {
             self.record_by_itself(&room, &mut state);
         }
         let (evict, evicted) = oneshot::channel();
@@ -294,6 +301,8 @@ impl Rooms {
                 shown: None,
                 neutrals: BTreeMap::new(),
                 recording: None,
+                records_by_itself: false,
+                fed_session: None,
                 empty_since: Instant::now(),
                 is_home: self.others.is_none(),
                 epoch: 0,

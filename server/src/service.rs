@@ -248,7 +248,7 @@ pub async fn run(
         cluster.wait().await;
     }
     if let Some(Play { file, room, request }) = hub.config.play.clone() {
-        hub.players.start(&hub, &room, &file, request, &|_| true).map_err(ServerError::Play)?;
+        hub.players.start(&hub, &room, file, request, None, |_| true).await.map_err(ServerError::Play)?;
     }
     listen::start(&hub, ports);
     vmc_out::start(&hub, outs);
@@ -315,7 +315,14 @@ fn accept(hub: &Arc<Hub>, stream: TcpStream, peer: SocketAddr, app: &axum::Route
             let mut request: Request = request.map(axum::body::Body::new);
             request.extensions_mut().insert(Peer(peer));
             request.extensions_mut().insert(place.clone());
-            app.clone().call(request)
+            let (mut app, place) = (app.clone(), place.clone());
+            async move {
+                // Nothing else is read from the connection meanwhile.
+                if let Some(due) = place.take_request(Instant::now()) {
+                    tokio::time::sleep_until(due.into()).await;
+                }
+                app.call(request).await
+            }
         });
         let connection = hyper::server::conn::http1::Builder::new()
             .timer(TokioTimer::new())
@@ -387,11 +394,12 @@ struct Host {
     connections: usize,
     arrivals: Allowance,
     messages: Allowance,
+    requests: Allowance,
 }
 
-/// So many a second, after a burst.
+/// So many a second, after a burst of [`BURST`].
 #[derive(Debug, Default)]
-struct Allowance {
+pub(crate) struct Allowance {
     /// When what came so far would have come at the allowed rate.
     due: Option<Instant>,
 }
@@ -399,17 +407,17 @@ struct Allowance {
 impl Allowance {
     /// Counts one; gives when it would have come at the allowed rate, where that is later than now.
     fn take(&mut self, per_second: u32, now: Instant) -> Option<Instant> {
-        let due = self.due.unwrap_or(now).max(now.checked_sub(BURST).unwrap_or(now)) + Duration::from_secs(1) / per_second;
+        // The first one begins a whole burst.
+        let earliest = now.checked_sub(BURST).unwrap_or(now);
+        let due = self.due.unwrap_or(earliest).max(earliest) + Duration::from_secs(1) / per_second;
         self.due = Some(due);
         (due > now).then_some(due)
     }
 
     /// Counts one where the rate allows it now.
-    fn take_if_free(&mut self, per_second: u32, now: Instant) -> bool {
+    pub fn take_if_free(&mut self, per_second: u32, now: Instant) -> bool {
         let is_free = self.due.is_none_or(|due| due <= now);
         if is_free {
-            // The first one begins a whole burst.
-            self.due.get_or_insert(now.checked_sub(BURST).unwrap_or(now));
             self.take(per_second, now);
         }
         is_free
@@ -449,10 +457,16 @@ impl Connections {
         Ok(())
     }
 
-    /// Counts a publisher's message; gives the time before which no other shall be read.
+    /// Counts a message of a publisher, or of who commands one; gives the time before which no other shall be read.
     fn take_message(&mut self, address: Option<IpAddr>, limits: &Limits, now: Instant) -> Option<Instant> {
         let host = self.by_address.get_mut(&address?)?;
         host.messages.take(limits.frames_per_second_per_address, now)
+    }
+
+    /// Counts a request; gives the time before which it shall not be answered.
+    fn take_request(&mut self, address: Option<IpAddr>, limits: &Limits, now: Instant) -> Option<Instant> {
+        let host = self.by_address.get_mut(&address?)?;
+        host.requests.take(limits.requests_per_second_per_address, now)
     }
 
     fn give_back(&mut self, address: Option<IpAddr>) {
@@ -492,7 +506,13 @@ impl Place {
         Ok(Self { hub: hub.clone(), address })
     }
 
-    /// Counts a publisher's message; gives the time before which no other shall be read.
+    /// Counts a request; gives the time before which it shall not be answered.
+    fn take_request(&self, now: Instant) -> Option<Instant> {
+        self.address?;
+        self.hub.connections().take_request(self.address, &self.hub.config.limits, now)
+    }
+
+    /// Counts a message of a publisher, or of who commands one; gives the time before which no other shall be read.
     pub fn take_message(&self, now: Instant) -> Option<Instant> {
         // Loopback, which is not limited, costs no lock.
         self.address?;
@@ -593,5 +613,22 @@ mod tests {
         }
         assert!((now - start).as_secs_f64() > 5.5, "{:?}", now - start);
         assert_eq!(connections.take_message(None, &limits, now), None, "loopback");
+    }
+
+    #[test]
+    fn requests_of_one_address_are_slowed_down_whatever_connection_they_come_by() {
+        let limits = Limits { requests_per_second_per_address: 10, ..Limits::default() };
+        let mut connections = Connections::default();
+        let address = counted_as("192.0.2.1".parse().unwrap());
+        let start = Instant::now() + Duration::from_secs(60);
+        connections.take(address, &limits, start).unwrap();
+        let num_free = (0..100).take_while(|_| connections.take_request(address, &limits, start).is_none()).count();
+        assert_eq!(num_free, 40, "a page that loads waits for nothing");
+        let mut now = start;
+        for _ in 0..100 {
+            now = connections.take_request(address, &limits, now).unwrap_or(now);
+        }
+        assert!((9.9..10.3).contains(&(now - start).as_secs_f64()), "{:?}", now - start);
+        assert_eq!(connections.take_request(None, &limits, now), None, "loopback");
     }
 }

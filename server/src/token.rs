@@ -26,7 +26,7 @@ const MOST_KEYS: usize = 16;
 const MOST_TOKEN_BYTES: usize = 4096;
 /// What clocks may differ by, seconds.
 const LEEWAY_SECONDS: u64 = 5;
-/// Longest life of a token.
+/// Longest life of a token, seconds.
 const MOST_SECONDS: u64 = 366 * 86_400;
 
 /// Why there is no key or no token.
@@ -175,7 +175,7 @@ impl Checker {
         Self(Arc::new(RwLock::new(Arc::new(vec![DecodingKey::from_secret(&key)]))))
     }
 
-    /// What `token` says, where a key has signed it and its time is not over.
+    /// What `token` says, where a key has signed it and its time is not over, nor further away than that of any token made here.
     pub fn check(&self, token: &str) -> Result<Claims, Refusal> {
         if token.len() > MOST_TOKEN_BYTES {
             return Err(Refusal::Bad);
@@ -187,6 +187,8 @@ impl Checker {
         let mut refusal = Refusal::Bad;
         for key in keys.iter() {
             match decode::<Claims>(token, key, &validation) {
+                // One that nobody here can have made; and times so far away cannot be reckoned with.
+                Ok(data) if data.claims.exp > now_seconds().saturating_add(MOST_SECONDS + LEEWAY_SECONDS) => return Err(Refusal::Bad),
                 Ok(data) => return Ok(data.claims),
                 // Looked at after the signature.
                 Err(error) if matches!(error.kind(), ErrorKind::ExpiredSignature) => refusal = Refusal::Expired,
@@ -415,6 +417,10 @@ mod tests {
         let says = |exp: u64| signed(&file.0, &head, &Claims { role: Role::Admin, rooms: vec!["*".into()], exp, iat: 0 });
         assert_eq!(checker.check(&says(now - 60)), Err(Refusal::Expired));
         assert!(checker.check(&says(now - 2)).is_ok(), "clocks differ a little");
+        assert!(checker.check(&says(now + MOST_SECONDS)).is_ok());
+        for end in [now + MOST_SECONDS + 60, u64::MAX / 2, u64::MAX] {
+            assert_eq!(checker.check(&says(end)), Err(Refusal::Bad), "longer than any token holds: {end}");
+        }
         let later = serde_json::json!({"role": "view", "rooms": ["a"], "exp": now + 100, "nbf": now + 50});
         assert_eq!(checker.check(&signed(&file.0, &head, &later)), Err(Refusal::Bad), "not yet");
     }

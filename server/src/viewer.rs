@@ -6,7 +6,7 @@
 
 use crate::config::seconds;
 use crate::room::{Latest, Viewing};
-use crate::service::{Hub, stopped};
+use crate::service::{Allowance, Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, frame_bytes, send};
 use futures_util::{SinkExt, StreamExt};
 use rhytid_shared::RoomName;
@@ -28,6 +28,9 @@ const WINDOW: Duration = Duration::from_millis(300);
 /// How often a packet goes to a viewer that has not answered a ping yet, once [`WINDOW`] is over. One that never does breaks the
 /// protocol (RFC 6455, 5.5.2): it still shows that something moves, until the idle time-out, and kernels hold little for it.
 const TRICKLE: Duration = Duration::from_secs(1);
+/// Messages a second from a viewer, after a burst of some seconds' worth: pongs, of which it has eight to send at most, and pings of
+/// its own.
+const MOST_MESSAGES: u32 = 50;
 /// Largest message of a viewer, bytes: it has nothing to say but pongs.
 const LARGEST_MESSAGE: usize = 1024;
 
@@ -71,6 +74,7 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
     let (idle, ping_interval, write) = (seconds(timeouts.viewer_idle), seconds(timeouts.ping), seconds(timeouts.write));
     let mut pace = Pace::new(Instant::now());
     let mut sent = Sent::default();
+    let mut messages = Allowance::default();
     // A state that stands there already is news to this viewer.
     viewing.slot.mark_changed();
     let mut has_news = false;
@@ -116,6 +120,10 @@ async fn run(hub: &Hub, socket: &mut Socket, viewing: &mut Viewing, wants_json: 
                 has_news = true;
             }
             message = socket.next() => match message {
+                Some(Ok(_)) if !messages.take_if_free(MOST_MESSAGES, std::time::Instant::now()) => {
+                    let message = format!("more than {MOST_MESSAGES} messages a second: a viewer has nothing to say");
+                    return Ending::error(CloseCode::Policy, ErrorMessage::new("too_fast", message)).into();
+                }
                 Some(Ok(Message::Pong(_))) => pace.hear(Instant::now()),
                 Some(Ok(Message::Close(_))) | None => return Stop::Gone("closed"),
                 // Viewers have nothing to say yet; what they say is ignored.

@@ -209,6 +209,42 @@ fn more_is_logged_with_verbose() {
 }
 
 #[cfg(target_os = "linux")]
+#[cfg(unix)]
+#[test]
+fn a_viewer_that_talks_without_end_is_sent_away_and_one_that_commands_nobody_is_slowed() {
+    let server = serve(&[]);
+    let mut quiet = view(&server, "");
+    let mut viewer = view(&server, "");
+    for _ in 0..1000 {
+        // It may be gone before all are sent, and its last word lost with them.
+        let _ = viewer.send(Message::text("hear me"));
+    }
+    let count = || {
+        let metrics = http::ask(&server.address, "GET", "/metrics", &[], "").unwrap().1;
+        metrics.lines().any(|line| line.contains("\"too_fast\"") && line.ends_with(" 1")).then_some(())
+    };
+    process::wait_for("its end", count);
+    // A second's worth of pings of one's own is fine.
+    for _ in 0..50 {
+        quiet.send(Message::Ping("still there?".into())).unwrap();
+    }
+    let mut num_pongs = 0;
+    while num_pongs < 1 {
+        num_pongs += usize::from(quiet.read().unwrap().is_pong());
+    }
+    // Two seconds' worth of commands to a slot that nobody has.
+    let start = Instant::now();
+    let mut control = socket::open(&server.address, "demo/control", &[], PATIENCE).unwrap();
+    for _ in 0..100 {
+        control.send(Message::text(r#"{"type":"calibrate"}"#)).unwrap();
+    }
+    let mut num_refused = 0;
+    while num_refused < 100 {
+        num_refused += usize::from(control.read().unwrap().to_text().is_ok_and(|text| text.contains("no_source")));
+    }
+    assert!(start.elapsed().as_secs_f64() > 1.5, "{:?}", start.elapsed());
+}
+
 #[test]
 fn a_closed_standard_output_is_no_end() {
     // Writing to this device always fails.

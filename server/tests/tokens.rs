@@ -189,7 +189,25 @@ fn recordings_open_to_the_right_token_only() {
     assert_eq!(played("/api/rooms/demo/replay", None), missing);
     assert_eq!(played("/api/rooms/demo/replay", Some(&view)), role);
     assert_eq!(played("/api/rooms/demo/replay", Some(&other)), room);
-    assert_eq!(played("/api/rooms/other/replay", Some(&other)), room, "a recording of another room");
+    // A recording of another room is not there, whatever state it is in, nor is one that is nobody's.
+    let broken = |name: &str| std::fs::write(format!("{takes}/{name}"), b"nonsense").unwrap();
+    let play = |name: &str, room: &str, token: &String| {
+        let body = serde_json::json!({ "file": name }).to_string();
+        let (status, answer) = ask(&server, "POST", &format!("/api/rooms/{room}/replay"), Some(token), &body);
+        assert!(!answer.contains(&takes), "it does not say where recordings are kept: {answer}");
+        (status, answer.replace(name, "NAME"))
+    };
+    let absent = play("demo-20260131T235959Z-7.mcap", "other", &other);
+    assert!(absent.0 == 404 && absent.1.contains("no_such_recording"), "{absent:?}");
+    broken("demo-20260131T235959Z.mcap");
+    broken("a.mcap");
+    for name in [file.as_str(), "demo-20260131T235959Z.mcap", "a.mcap"] {
+        assert_eq!(play(name, "other", &other), absent, "{name}");
+    }
+    for (name, token) in [("demo-20260131T235959Z.mcap", &publish), ("a.mcap", &admin)] {
+        let told = play(name, "demo", token);
+        assert!(told.0 == 422 && told.1.contains("recording NAME: it is no MCAP file"), "{told:?}");
+    }
     assert_eq!(played("/api/rooms/other/replay", Some(&admin)), ok);
     assert_eq!(played("/api/rooms/demo/replay", Some(&publish)), ok);
     for (token, expected) in [(None, &missing), (Some(&view), &role), (Some(&other), &room), (Some(&publish), &ok)] {

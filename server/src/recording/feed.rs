@@ -23,6 +23,8 @@ pub struct RecordedSession {
 pub struct RecordedFeed {
     recording: Recording,
     slot: String,
+    /// Its number in its room.
+    session: u32,
     /// The profile that the hello or the next command names, which the other end may not keep.
     profile: Option<Box<Profile>>,
     /// Reads binary messages, which a feed has as text.
@@ -92,14 +94,15 @@ impl RecordedFeed {
         for chunk in 0..recording.chunks().len() {
             let entries = recording.read_chunk(chunk)?;
             for (at, entry) in entries.iter().enumerate() {
-                let Some(SessionEvent::Start { slot, under_way: false, profile, .. }) = event(entry) else { continue };
+                let Some(SessionEvent::Start { session, slot, under_way: false, profile, .. }) = event(entry) else { continue };
                 if left > 0 {
                     left -= 1;
                     continue;
                 }
                 let (waiting, line, is_over) = (VecDeque::new(), Vec::new(), false);
                 let (reader, frame) = (PublishReader::for_any_character(), TrackingFrame::default());
-                let mut feed = Self { recording, slot, profile, reader, frame, chunk: chunk + 1, waiting, line, at: 0, is_over, range };
+                let mut feed =
+                    Self { recording, slot, session, profile, reader, frame, chunk: chunk + 1, waiting, line, at: 0, is_over, range };
                 feed.gather(&entries[at + 1..], true);
                 return Ok(Ok(feed));
             }
@@ -137,15 +140,13 @@ impl RecordedFeed {
                     let line = self.line_of(&entry.data);
                     self.waiting.push_back(line);
                 }
-                Topic::Session if matches!(event(entry), Some(SessionEvent::Profile { .. })) => {
-                    if let Some(SessionEvent::Profile { profile, .. }) = event(entry) {
-                        self.profile = Some(profile);
-                    }
-                }
-                // The next session of this slot.
-                Topic::Session if matches!(event(entry), Some(SessionEvent::Start { slot, .. }) if slot == self.slot) => {
-                    self.is_over = true
-                }
+                Topic::Session => match event(entry) {
+                    // Other sessions' are for messages of theirs.
+                    Some(SessionEvent::Profile { session, profile }) if session == self.session => self.profile = Some(profile),
+                    // The next session of this slot.
+                    Some(SessionEvent::Start { slot, .. }) if slot == self.slot => self.is_over = true,
+                    _ => {}
+                },
                 _ => {}
             }
             if self.is_over {
@@ -206,5 +207,54 @@ impl BufRead for RecordedFeed {
 
     fn consume(&mut self, num: usize) {
         self.at += num;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::format::VERSION;
+    use super::super::writer::RecordingWriter;
+    use super::*;
+    use rhytid_shared::packet::PacketLayout;
+    use rhytid_shared::view::ViewHello;
+
+    #[test]
+    fn a_session_names_its_own_profiles_and_no_others() {
+        let (character, _) = crate::load_character(None).unwrap();
+        let mut bytes = Vec::new();
+        let mut writer = RecordingWriter::to(&mut bytes, PacketLayout::from(&*character)).unwrap();
+        let hello = ViewHello::new("", &character, String::new());
+        let (room, server, character) = ("a".into(), "test".into(), Box::new(hello.character));
+        let start = |session, slot: &str| {
+            let (slot, source) = (slot.to_owned(), "test".to_owned());
+            SessionEvent::Start { session, slot, source, under_way: false, kept_neutral: None, profile: None, solve: None }
+        };
+        let profile = |session, name: &str| {
+            let profile = Profile::from_json(&format!(r#"{{"rhytid_profile":1,"name":"{name}","measured":"weights"}}"#)).unwrap();
+            SessionEvent::Profile { session, profile: Box::new(profile) }
+        };
+        let hello = br#"{"type":"hello","version":1}"#;
+        let names = |name: &str| format!(r#"{{"type":"profile","profile":"{name}"}}"#).into_bytes();
+        let (main, phone) = (Topic::Text("main".into()), Topic::Text("phone".into()));
+        writer.event(1, &SessionEvent::Recording { version: VERSION, room, server, character, clock: 0 }).unwrap();
+        writer.event(2, &start(1, "main")).unwrap();
+        writer.message(&main, 2, None, hello).unwrap();
+        writer.event(3, &start(2, "phone")).unwrap();
+        writer.message(&phone, 3, None, hello).unwrap();
+        // Both change theirs in one moment.
+        writer.event(4, &profile(1, "anna")).unwrap();
+        writer.event(4, &profile(2, "bert")).unwrap();
+        writer.message(&main, 4, None, &names("anna")).unwrap();
+        writer.message(&phone, 4, None, &names("bert")).unwrap();
+        writer.finish().unwrap();
+        for (index, name) in [(0, "anna"), (1, "bert")] {
+            let recording = Recording::from_bytes(bytes.clone(), "both".into()).unwrap();
+            let mut feed = RecordedFeed::session(recording, index, [0.0, f64::INFINITY]).unwrap().ok().unwrap();
+            let mut text = String::new();
+            feed.read_to_string(&mut text).unwrap();
+            let lines: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+            assert_eq!((lines.len(), &lines[1]["profile"]["name"]), (2, &name.into()), "{text}");
+            assert!(lines[0].get("profile").is_none(), "{text}");
+        }
     }
 }

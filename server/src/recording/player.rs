@@ -4,17 +4,21 @@
 use super::faces::{Faces, Moment};
 use super::format::SessionEvent;
 use super::reader::{ReadError, Recording};
-use super::writer::Item;
+use super::writer::{Item, room_of_file};
+use crate::config::seconds;
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
-use rhytid_shared::RoomName;
+use rhytid_shared::{PublishHello, RoomName};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+use tokio::sync::Semaphore;
 
+/// Recordings that are opened at a time: of one that was not finished, the head of every chunk is read.
+const MOST_OPENING: usize = 2;
 /// Players at a time: each is a thread and a few hundred KB.
 const MOST_PLAYERS: usize = 16;
 /// How often a face that stands still is sent again, so that viewers do not take its sender for gone.
@@ -23,6 +27,8 @@ const HOLD: Duration = Duration::from_millis(50);
 const LOOK: Duration = Duration::from_millis(100);
 /// Speeds that make sense; an infinite one sends everything at once.
 const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=100.0;
+/// Requests of one player that may wait for it: each jump takes it some milliseconds.
+const MOST_WAITING: usize = 64;
 /// Frames sent in a row at infinite speed before commands are looked at.
 const BURST: usize = 256;
 
@@ -94,15 +100,12 @@ pub enum PlayError {
     /// The server was started without a folder of recordings.
     #[error("this server keeps no recordings; start it with --record DIR")]
     NoFolder,
-    /// The name is none of a recording.
+    /// The name is none of a recording, or of one of a room that whoever asks may not watch: which of the two, nobody learns.
     #[error("field file is {got:?}, expected the name of a recording in the server's folder")]
     File {
         /// The name.
         got: String,
     },
-    /// It is of a room that whoever asks may not watch. It is not said of which.
-    #[error("the recording is of another room than the token is for")]
-    Forbidden,
     /// A number outside its range.
     #[error("field {field} is {got}, expected {expected}")]
     Range {
@@ -116,9 +119,32 @@ pub enum PlayError {
     /// There are too many.
     #[error("the server plays {MOST_PLAYERS} recordings already, which is its limit")]
     TooMany,
+    /// It is told more than it can do.
+    #[error("the player has {MOST_WAITING} requests waiting, which is its limit")]
+    Busy,
+    /// The machine has no thread for it.
+    #[error("cannot start a thread: {0}")]
+    Thread(String),
     /// The room cannot be had.
-    #[error("{0}")]
-    Room(String),
+    #[error("{problem}")]
+    Room {
+        /// Why, short and stable, as publishers are told it.
+        code: &'static str,
+        /// The same in words.
+        problem: String,
+    },
+}
+
+impl PlayError {
+    fn no_file(name: &str) -> Self {
+        Self::File { got: name.chars().take(80).collect() }
+    }
+}
+
+impl From<RoomError> for PlayError {
+    fn from(error: RoomError) -> Self {
+        Self::Room { code: error.code(), problem: error.to_string() }
+    }
 }
 
 impl PlayRequest {
@@ -136,14 +162,20 @@ impl PlayRequest {
 }
 
 /// All players, by room.
-#[derive(Default)]
 pub(crate) struct Players {
     by_room: Mutex<BTreeMap<RoomName, Handle>>,
+    opening: Arc<Semaphore>,
+}
+
+impl Default for Players {
+    fn default() -> Self {
+        Self { by_room: Mutex::default(), opening: Arc::new(Semaphore::new(MOST_OPENING)) }
+    }
 }
 
 /// A player's outer end; dropped, it ends.
 struct Handle {
-    requests: Sender<PlayRequest>,
+    requests: SyncSender<PlayRequest>,
     status: Arc<Mutex<PlayStatus>>,
 }
 
@@ -153,22 +185,26 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Players {
-    /// Does what `request` says in `room`. May read a file, which is played where `may_watch` says so of the room it was made of.
-    pub fn request(
+    /// Does what `request` says in `room`. A file is played as by [`Self::start`].
+    pub async fn request(
         &self,
         hub: &Arc<Hub>,
         room: &RoomName,
         request: PlayRequest,
-        may_watch: &dyn Fn(&RoomName) -> bool,
+        may_watch: impl Fn(Option<&RoomName>) -> bool,
     ) -> Result<PlayStatus, PlayError> {
         request.check()?;
         if let Some(file) = &request.file {
             let path = path_of(hub.recorder.dir(), file)?;
-            return self.start(hub, room, &path, request, may_watch);
+            let most_standing = Some(seconds(hub.config.timeouts.replay_idle));
+            return self.start(hub, room, path, request, most_standing, may_watch).await;
         }
         let by_room = lock(&self.by_room);
         let handle = by_room.get(room).filter(|handle| lock(&handle.status).error.is_none()).ok_or(PlayError::NoPlayer)?;
-        handle.requests.send(request.clone()).map_err(|_| PlayError::NoPlayer)?;
+        handle.requests.try_send(request.clone()).map_err(|error| match error {
+            TrySendError::Full(_) => PlayError::Busy,
+            TrySendError::Disconnected(_) => PlayError::NoPlayer,
+        })?;
         let mut status = lock(&handle.status).clone();
         // As it will be in a moment.
         status.position = request.position.unwrap_or(status.position);
@@ -178,24 +214,69 @@ impl Players {
         Ok(status)
     }
 
-    /// Plays the recording at `path` in `room`, where `may_watch` says so of the room it was made of.
-    pub fn start(
+    /// Plays the recording at `path` in `room`, where `may_watch` says so of the room it was made of; of one whose room is not known,
+    /// where it says so of none. Ends where it has stood still for `most_standing`.
+    pub async fn start(
         &self,
         hub: &Arc<Hub>,
         room: &RoomName,
-        path: &Path,
+        path: PathBuf,
         request: PlayRequest,
-        may_watch: &dyn Fn(&RoomName) -> bool,
+        most_standing: Option<Duration>,
+        may_watch: impl Fn(Option<&RoomName>) -> bool,
     ) -> Result<PlayStatus, PlayError> {
         request.check()?;
-        let recording = Recording::open(path)?;
-        if !RoomName::new(recording.room()).is_ok_and(|recorded| may_watch(&recorded)) {
-            return Err(PlayError::Forbidden);
+        self.check_place(room)?;
+        let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let permit = self.opening.clone().acquire_owned().await.map_err(|error| PlayError::Thread(error.to_string()))?;
+        // Opening a recording reads its index.
+        let name = file.clone();
+        let open = move || {
+            // Until it is done, also where nobody waits for it any more.
+            let _permit = permit;
+            // Where the server keeps it is nobody's business.
+            Recording::open_as(&path, name)
+        };
+        let opened = tokio::task::spawn_blocking(open).await.map_err(|error| PlayError::Thread(error.to_string()))?;
+        let recorded = match &opened {
+            Ok(recording) => RoomName::new(recording.room()).ok(),
+            // Its name says whose it is.
+            Err(_) => room_of_file(&file),
+        };
+        if !may_watch(recorded.as_ref()) {
+            return Err(PlayError::no_file(&file));
         }
+        let recording = opened?;
         if recording.character().sha256 != hub.character.sha256 {
             let (recorded, served) = (recording.character().name.clone(), hub.character.name.clone());
             return Err(PlayError::Character { recorded, served });
         }
+        if let Some(cluster) = &hub.cluster {
+            // Last of all: another node's publisher has to go only for what can be played.
+            let hello = PublishHello { source: source_of(&file), takeover: request.takeover, ..PublishHello::default() };
+            let entered = cluster.enter(&hub.rooms, room, &hello).await;
+            entered.map_err(|error| PlayError::Room { code: error.code(), problem: error.to_string() })?;
+        }
+        self.seat(hub, room, file, recording, &request, most_standing)
+    }
+
+    /// Says so where there are too many already for another one in `room`.
+    fn check_place(&self, room: &RoomName) -> Result<(), PlayError> {
+        let by_room = lock(&self.by_room);
+        let others = by_room.iter().filter(|(name, handle)| *name != room && lock(&handle.status).error.is_none()).count();
+        if others >= MOST_PLAYERS { Err(PlayError::TooMany) } else { Ok(()) }
+    }
+
+    /// Starts the thread that plays `recording`, called `file`.
+    fn seat(
+        &self,
+        hub: &Arc<Hub>,
+        room: &RoomName,
+        file: String,
+        recording: Recording,
+        request: &PlayRequest,
+        most_standing: Option<Duration>,
+    ) -> Result<PlayStatus, PlayError> {
         let mut by_room = lock(&self.by_room);
         // One of our own in this room makes place; others that have ended are forgotten.
         let replaces = by_room.remove(room).is_some_and(|handle| lock(&handle.status).error.is_none());
@@ -203,27 +284,26 @@ impl Players {
         if by_room.len() >= MOST_PLAYERS {
             return Err(PlayError::TooMany);
         }
-        let seconds = recording.seconds();
-        let from = request.from.unwrap_or(0.0).min(seconds);
+        let length = recording.seconds();
+        let from = request.from.unwrap_or(0.0).min(length);
         let status = PlayStatus {
-            file: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            file,
             position: request.position.unwrap_or(from),
-            seconds,
+            seconds: length,
             playing: request.playing.unwrap_or(true),
             speed: request.speed.unwrap_or(1.0),
             repeats: request.repeats.unwrap_or(false),
             from,
-            to: request.to.unwrap_or(seconds).clamp(from, seconds),
+            to: request.to.unwrap_or(length).clamp(from, length),
             error: None,
         };
-        let source = format!("replay of {}", status.file);
-        let place = Seat::take(hub, room, &source, request.takeover || replaces).map_err(|error| PlayError::Room(error.to_string()))?;
-        let (requests, inbox) = channel();
+        let place = Seat::take(hub, room, &source_of(&status.file), Hold { takeover: request.takeover || replaces, resume: None })?;
+        let (requests, inbox) = sync_channel(MOST_WAITING);
         let shared = Arc::new(Mutex::new(status.clone()));
         let handle = Handle { requests, status: shared.clone() };
         let hub = hub.clone();
         let run = move || {
-            let mut player = Player::new(&hub, Faces::new(recording), place, status);
+            let mut player = Player::new(&hub, Faces::new(recording), place, status, most_standing);
             let ended = player.run(&inbox, &shared);
             let mut status = lock(&shared);
             status.playing = false;
@@ -232,7 +312,7 @@ impl Players {
             drop(player);
         };
         let thread = std::thread::Builder::new().name("player".into()).spawn(run);
-        thread.map_err(|error| PlayError::Room(format!("cannot start a thread: {error}")))?;
+        thread.map_err(|error| PlayError::Thread(error.to_string()))?;
         let told = lock(&handle.status).clone();
         by_room.insert(room.clone(), handle);
         Ok(told)
@@ -249,6 +329,11 @@ impl Players {
     }
 }
 
+/// What a player of `file` calls itself in its room.
+fn source_of(file: &str) -> String {
+    format!("replay of {file}")
+}
+
 /// The recording called `name` in `dir`: a plain name, so that nothing outside can be meant.
 fn path_of(dir: Option<&Path>, name: &str) -> Result<PathBuf, PlayError> {
     let dir = dir.ok_or(PlayError::NoFolder)?;
@@ -257,7 +342,7 @@ fn path_of(dir: Option<&Path>, name: &str) -> Result<PathBuf, PlayError> {
         && !name.starts_with('.')
         && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'_'));
     let path = dir.join(name);
-    if is_plain && path.is_file() { Ok(path) } else { Err(PlayError::File { got: name.chars().take(80).collect() }) }
+    if is_plain && path.is_file() { Ok(path) } else { Err(PlayError::no_file(name)) }
 }
 
 /// The player's place in its room, for one session.
@@ -266,9 +351,19 @@ struct Seat {
     evicted: Evicted,
 }
 
+/// Whose place a player takes.
+#[derive(Debug, Clone, Copy, Default)]
+struct Hold {
+    /// Anybody's.
+    takeover: bool,
+    /// That of this session, its own before.
+    resume: Option<u32>,
+}
+
 impl Seat {
-    fn take(hub: &Hub, room: &RoomName, source: &str, takeover: bool) -> Result<Self, RoomError> {
-        let claim = SlotClaim { source: source.to_owned(), takeover, ..SlotClaim::default() };
+    fn take(hub: &Hub, room: &RoomName, source: &str, hold: Hold) -> Result<Self, RoomError> {
+        let claim =
+            SlotClaim { source: source.to_owned(), takeover: hold.takeover, resume: hold.resume, is_replay: true, ..SlotClaim::default() };
         let recorded = |session| {
             let (slot, source) = (claim.slot.name.clone(), claim.source.clone());
             // Its packets are recorded, and no messages that they could be solved from.
@@ -294,6 +389,7 @@ struct Player<'a> {
     source: String,
     faces: Faces,
     seat: Seat,
+    has_lost_room: bool,
     num_frames: u32,
     status: PlayStatus,
     /// The next face's time; it stands in the reader.
@@ -305,24 +401,30 @@ struct Player<'a> {
     /// When the session began, and its last time, µs.
     begun: Instant,
     last_micros: Option<u64>,
+    /// How long it may stand still, and since when it does, or was last told something.
+    most_standing: Option<Duration>,
+    stands_since: Instant,
 }
 
 impl<'a> Player<'a> {
-    fn new(hub: &'a Hub, faces: Faces, seat: Seat, status: PlayStatus) -> Self {
+    fn new(hub: &'a Hub, faces: Faces, seat: Seat, status: PlayStatus, most_standing: Option<Duration>) -> Self {
         let now = Instant::now();
         Self {
             hub,
             room: seat.place.room.name.clone(),
-            source: format!("replay of {}", status.file),
+            source: source_of(&status.file),
             shown: faces.frame().clone(),
             faces,
             seat,
+            has_lost_room: false,
             num_frames: 0,
             next: None,
             anchor: (status.position, now),
             status,
             begun: now,
             last_micros: None,
+            most_standing,
+            stands_since: now,
         }
     }
 
@@ -337,15 +439,23 @@ impl<'a> Player<'a> {
             let wait =
                 due.map_or(HOLD, |due| due.saturating_duration_since(Instant::now())).min(if self.status.playing { LOOK } else { HOLD });
             match inbox.recv_timeout(wait) {
-                Ok(request) => self.obey(&request)?,
+                Ok(request) => {
+                    self.stands_since = Instant::now();
+                    self.obey(&request)?;
+                }
                 Err(RecvTimeoutError::Disconnected) => return Ok("ended"),
                 Err(RecvTimeoutError::Timeout) => {}
             }
             if *self.hub.shutdown.borrow() {
                 return Ok("the server is shutting down");
             }
-            if self.seat.evicted.try_recv().is_ok() {
+            if self.is_evicted() {
                 return Ok("another publisher has taken the room over");
+            }
+            if self.status.playing {
+                self.stands_since = Instant::now();
+            } else if self.most_standing.is_some_and(|most| self.stands_since.elapsed() >= most) {
+                return Ok("it has stood still for too long");
             }
             if self.status.playing {
                 self.play()?;
@@ -415,16 +525,25 @@ impl<'a> Player<'a> {
 
     /// Begins a session anew, unless another publisher has the room.
     fn renew(&mut self) {
-        if self.seat.evicted.try_recv().is_ok() {
-            // Found again by the loop: nobody evicts a place twice, so it is told to end itself.
-            self.hub.players.stop(&self.room);
+        if self.is_evicted() {
             return;
         }
-        if let Ok(seat) = Seat::take(self.hub, &self.room, &self.source, true) {
-            self.seat = seat;
-            self.num_frames = 0;
-            (self.begun, self.last_micros) = (Instant::now(), None);
+        let resume = Some(self.seat.place.session);
+        match Seat::take(self.hub, &self.room, &self.source, Hold { resume, ..Hold::default() }) {
+            Ok(seat) => {
+                self.seat = seat;
+                self.num_frames = 0;
+                (self.begun, self.last_micros) = (Instant::now(), None);
+            }
+            // Taken in this moment.
+            Err(_) => self.has_lost_room = true,
         }
+    }
+
+    /// True once another publisher has the room. A place is told of that once, so it is kept in mind.
+    fn is_evicted(&mut self) -> bool {
+        self.has_lost_room |= self.seat.evicted.try_recv().is_ok();
+        self.has_lost_room
     }
 
     /// Shows the face at `position`, seconds, and goes on from there.

@@ -66,6 +66,9 @@ impl<T: Read + Seek + Send> Bytes for T {}
 pub struct Recording {
     source: Source,
     chunks: Vec<ChunkPlace>,
+    /// So many of the first chunks have been looked through for channels: those stand where they were first used, and only a finished
+    /// file lists them at its end as well.
+    num_known: usize,
     room: String,
     server: String,
     character: CharacterHello,
@@ -78,7 +81,11 @@ pub struct Recording {
 impl Recording {
     /// Opens a file and reads its index; of a file that was not finished, what stands in it whole.
     pub fn open(path: &Path) -> Result<Self, ReadError> {
-        let shown = path.display().to_string();
+        Self::open_as(path, path.display().to_string())
+    }
+
+    /// The same of a file that is called `shown` in errors.
+    pub(super) fn open_as(path: &Path, shown: String) -> Result<Self, ReadError> {
         let io = |source| ReadError::Io { path: shown.clone(), source };
         let file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
@@ -121,23 +128,17 @@ impl Recording {
         }
         chunks.sort_by_key(|chunk: &ChunkPlace| chunk.offset);
         let mut source = Source { file, path, length, channels };
-        let mut first = None;
-        // Channels stand where they were first used; a finished file lists them at its end as well.
-        let until = if cut_at.is_some() { chunks.len() } else { 1 };
-        for (index, chunk) in chunks.iter().take(until).enumerate() {
-            match source.read(chunk) {
-                Ok(entries) if index == 0 => first = entries.into_iter().next(),
-                Err(error) if index == 0 => return Err(error),
-                // Those that are damaged say so when they are read.
-                _ => {}
-            }
-        }
+        let first = match chunks.first() {
+            Some(chunk) => source.read(chunk).map_err(Unread::into_error)?.into_iter().next(),
+            None => None,
+        };
         let first = first.filter(|first| first.topic == Topic::Session);
         let first = first.ok_or_else(|| broken(format!("its first message is none of a {PROFILE} recording")))?;
         match serde_json::from_slice(&first.data) {
             Ok(SessionEvent::Recording { version: VERSION, room, server, character, clock }) => {
                 let layout = PacketLayout::try_from(&*character).map_err(|error: PacketError| broken(error.to_string()))?;
-                Ok(Self { source, chunks, room, server, character: *character, layout, clock, cut_at })
+                let num_known = if cut_at.is_some() { 1 } else { chunks.len() };
+                Ok(Self { source, chunks, num_known, room, server, character: *character, layout, clock, cut_at })
             }
             Ok(SessionEvent::Recording { version, .. }) => Err(broken(format!("it is of version {version}, expected {VERSION}"))),
             Ok(_) => Err(broken("its first message says nothing about it".into())),
@@ -180,6 +181,11 @@ impl Recording {
         &self.chunks
     }
 
+    /// Length of the file when it was opened, bytes.
+    pub(super) fn num_bytes(&self) -> u64 {
+        self.source.length
+    }
+
     /// Bytes that make no whole chunk at the end of a file that was not finished; nothing for one that was.
     pub fn cut_off(&self) -> Option<u64> {
         self.cut_at.map(|end| self.source.length - end)
@@ -199,7 +205,21 @@ impl Recording {
     /// The messages of chunk `index`, in their order.
     pub fn read_chunk(&mut self, index: usize) -> Result<Vec<Entry>, ReadError> {
         let chunk = self.chunks[index];
-        self.source.read(&chunk)
+        let read = self.source.read(&chunk);
+        if index == self.num_known {
+            self.num_known += 1;
+        }
+        match read {
+            Err(Unread::Channel(_)) if self.num_known < index => {
+                // Said in a chunk between, which nobody has read yet. Those that are damaged say so when they are read.
+                for chunk in &self.chunks[self.num_known..index] {
+                    drop(self.source.read(chunk));
+                }
+                self.num_known = index;
+                self.read_chunk(index)
+            }
+            read => read.map_err(Unread::into_error),
+        }
     }
 
     /// Index of the first chunk from which packets can be read so that the first of those at `from` (Unix clock, ns) or later are
@@ -238,15 +258,33 @@ struct Source {
     channels: HashMap<u16, Option<Topic>>,
 }
 
+/// Why a chunk could not be read.
+enum Unread {
+    /// It has messages of a channel that has not been seen.
+    Channel(ReadError),
+    Other(ReadError),
+}
+
+impl Unread {
+    fn into_error(self) -> ReadError {
+        let (Self::Channel(error) | Self::Other(error)) = self;
+        error
+    }
+}
+
+impl From<ReadError> for Unread {
+    fn from(error: ReadError) -> Self {
+        Self::Other(error)
+    }
+}
+
 impl Source {
-    fn read(&mut self, chunk: &ChunkPlace) -> Result<Vec<Entry>, ReadError> {
+    fn read(&mut self, chunk: &ChunkPlace) -> Result<Vec<Entry>, Unread> {
         let broken = |problem: String| ReadError::Broken { path: self.path.clone(), problem };
         let end = chunk.offset.checked_add(chunk.length).filter(|end| *end <= self.length);
         if end.is_none() || chunk.length > MAX_CHUNK as u64 || chunk.length < RECORD_HEAD {
-            return Err(broken(format!(
-                "chunk at byte {} has {} bytes, expected up to {MAX_CHUNK} in the file",
-                chunk.offset, chunk.length
-            )));
+            let problem = format!("chunk at byte {} has {} bytes, expected up to {MAX_CHUNK} in the file", chunk.offset, chunk.length);
+            return Err(broken(problem).into());
         }
         let mut bytes = vec![0; chunk.length as usize];
         self.file
@@ -258,9 +296,11 @@ impl Source {
         match mcap::parse_record(bytes[0], &bytes[RECORD_HEAD as usize..]) {
             // Uncompressed chunks have lengths of their own that nobody checks.
             Ok(Record::Chunk { header, .. }) if header.compression == "zstd" => {}
-            Ok(Record::Chunk { header, .. }) => return Err(at(format!("it is compressed by {:?}, expected \"zstd\"", header.compression))),
-            Ok(_) => return Err(at("it is no chunk".into())),
-            Err(error) => return Err(at(error.to_string())),
+            Ok(Record::Chunk { header, .. }) => {
+                return Err(at(format!("it is compressed by {:?}, expected \"zstd\"", header.compression)).into());
+            }
+            Ok(_) => return Err(at("it is no chunk".into()).into()),
+            Err(error) => return Err(at(error.to_string()).into()),
         }
         let options = LinearReaderOptions::default()
             .with_skip_start_magic(true)
@@ -285,14 +325,14 @@ impl Source {
                         let topic = self
                             .channels
                             .get(&header.channel_id)
-                            .ok_or_else(|| at(format!("channel {} is not there", header.channel_id)))?;
+                            .ok_or_else(|| Unread::Channel(at(format!("channel {} is not there", header.channel_id))))?;
                         if let Some(topic) = topic {
                             let (log_time, publish_time) = (header.log_time, header.publish_time);
                             entries.push(Entry { topic: topic.clone(), log_time, publish_time, data: data.into_owned() });
                         }
                     }
                     Ok(_) => {}
-                    Err(error) => return Err(at(error.to_string())),
+                    Err(error) => return Err(at(error.to_string()).into()),
                 },
             }
         }
@@ -348,4 +388,79 @@ pub(super) fn scan(file: &mut dyn Bytes, length: u64) -> io::Result<(Vec<ChunkPl
         at = end;
     }
     Ok((chunks, at))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::writer::RecordingWriter;
+    use super::*;
+    use rhytid_shared::view::ViewHello;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    /// Bytes that say how many of them were read.
+    struct Counted {
+        bytes: Cursor<Vec<u8>>,
+        num_read: Arc<AtomicU64>,
+    }
+
+    impl Read for Counted {
+        fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+            let num = self.bytes.read(out)?;
+            self.num_read.fetch_add(num as u64, Ordering::Relaxed);
+            Ok(num)
+        }
+    }
+
+    impl Seek for Counted {
+        fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+            self.bytes.seek(to)
+        }
+    }
+
+    /// A file that was cut, of chunks with a message each, which does not compress; from `second_from` on of another channel.
+    fn cut_file(num_chunks: u64, second_from: u64) -> Vec<u8> {
+        let (character, _) = crate::load_character(None).unwrap();
+        let mut bytes = Vec::new();
+        let mut writer = RecordingWriter::to(&mut bytes, PacketLayout::from(&*character)).unwrap();
+        let hello = ViewHello::new("", &character, String::new());
+        let (room, server, character) = ("a".into(), "test".into(), Box::new(hello.character));
+        writer.event(1, &SessionEvent::Recording { version: VERSION, room, server, character, clock: 0 }).unwrap();
+        let mut seed = 1u64;
+        for index in 0..num_chunks {
+            let noise: Vec<u8> = std::iter::repeat_with(|| {
+                seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                (seed >> 56) as u8
+            })
+            .take(20_000)
+            .collect();
+            let slot = if index < second_from { "first" } else { "second" };
+            writer.message(&Topic::Binary(slot.into()), 2 + index, None, &noise).unwrap();
+            writer.flush().unwrap();
+        }
+        writer.finish().unwrap();
+        // Of its index.
+        bytes.truncate(bytes.len() - 5_000);
+        bytes
+    }
+
+    #[test]
+    fn opening_a_cut_file_reads_little_of_it() {
+        let bytes = cut_file(100, 50);
+        let (length, num_read) = (bytes.len() as u64, Arc::<AtomicU64>::default());
+        let counted = Counted { bytes: Cursor::new(bytes), num_read: num_read.clone() };
+        let mut recording = Recording::read(Box::new(counted), length, "cut".into()).unwrap();
+        let num_opened = num_read.swap(0, Ordering::Relaxed);
+        assert!(num_opened < length / 10, "{num_opened} of {length} bytes");
+        // A channel that stands in a chunk between is found, once for all.
+        let topic = |entries: Vec<Entry>| entries.last().map(|entry| entry.topic.clone());
+        assert_eq!(topic(recording.read_chunk(80).unwrap()), Some(Topic::Binary("second".into())));
+        num_read.store(0, Ordering::Relaxed);
+        for index in [90, 3, 80, 49, 50] {
+            let slot = if index < 50 { "first" } else { "second" };
+            assert_eq!(topic(recording.read_chunk(index).unwrap()), Some(Topic::Binary(slot.into())), "{index}");
+        }
+        let num_again = num_read.load(Ordering::Relaxed);
+        assert!(num_again < length / 10, "{num_again} of {length} bytes");
+    }
 }

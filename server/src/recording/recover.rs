@@ -2,7 +2,7 @@
 
 use super::format::{SessionEvent, Topic};
 use super::reader::{ReadError, Recording};
-use super::writer::RecordingWriter;
+use super::writer::{RecordingWriter, hold};
 use mcap::McapError;
 use rhytid_shared::packet::BatchReader;
 use std::fs::{File, OpenOptions};
@@ -21,6 +21,12 @@ pub enum RecoverError {
         path: String,
         /// What happened.
         problem: String,
+    },
+    /// It is not cut, but not done yet; or it is being mended already.
+    #[error("{path} is still being written; end its recording first, or mend a copy of it with --out")]
+    Live {
+        /// The file.
+        path: String,
     },
 }
 
@@ -45,8 +51,19 @@ pub struct RecoverReport {
     pub orphans: u64,
 }
 
-/// Mends the recording at `path`, in its place, or into `out` (which must not exist). Without damage nothing is written.
+/// Mends the recording at `path`, in its place where nobody is writing it, or into `out` (which must not exist). Without damage
+/// nothing is written.
 pub fn recover(path: &Path, out: Option<&Path>) -> Result<RecoverReport, RecoverError> {
+    let live = || RecoverError::Live { path: path.display().to_string() };
+    // Until the mended file is in its place.
+    let own = match (out, File::open(path)) {
+        (None, Ok(file)) => Some(file),
+        // Opening it says what is wrong.
+        _ => None,
+    };
+    if own.as_ref().is_some_and(|file| !hold(file)) {
+        return Err(live());
+    }
     let mut recording = Recording::open(path)?;
     let target = out.map_or_else(|| temporary(path), Path::to_owned);
     let mut report = RecoverReport { cut_off: recording.cut_off().unwrap_or(0), ..RecoverReport::default() };
@@ -58,13 +75,28 @@ pub fn recover(path: &Path, out: Option<&Path>) -> Result<RecoverReport, Recover
         return Ok(report);
     }
     let broken = |problem: String| RecoverError::Write { path: target.display().to_string(), problem };
-    let file = OpenOptions::new().write(true).create_new(true).open(&target).map_err(|error| broken(error.to_string()))?;
-    let written = copy(&mut recording, file, &mut report);
-    let finished = written.and_then(|()| if out.is_none() { std::fs::rename(&target, path).map_err(McapError::Io) } else { Ok(()) });
+    let mut options = OpenOptions::new();
+    match out {
+        Some(_) => options.create_new(true),
+        // A mending that was killed has left its own.
+        None => options.create(true).truncate(true),
+    };
+    let file = options.write(true).open(&target).map_err(|error| broken(error.to_string()))?;
+    let finished = copy(&mut recording, file, &mut report).map_err(|error| broken(error.to_string())).and_then(|()| {
+        if out.is_some() {
+            return Ok(());
+        }
+        // Not every system and every disk says who holds a file.
+        if std::fs::metadata(path).is_ok_and(|now| now.len() != recording.num_bytes()) {
+            return Err(live());
+        }
+        std::fs::rename(&target, path).map_err(|error| broken(error.to_string()))
+    });
     if let Err(error) = finished {
         let _ = std::fs::remove_file(&target);
-        return Err(broken(error.to_string()));
+        return Err(error);
     }
+    drop(own);
     Ok(report)
 }
 

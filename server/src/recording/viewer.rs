@@ -1,7 +1,7 @@
 //! Recording as a viewer: the packets of a room on any server, without what its publisher sent.
 
 use super::format::{SessionEvent, VERSION};
-use super::writer::{RecordError, RecordingWriter};
+use super::writer::{RecordError, RecordingWriter, hold, nanos, unix_nanos};
 use crate::send::{SendError, connect};
 use futures_util::StreamExt;
 use mcap::McapError;
@@ -11,7 +11,7 @@ use rhytid_shared::view::ViewMessage;
 use std::fs::{File, OpenOptions};
 use std::future::Future;
 use std::path::Path;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 use tokio_tungstenite::tungstenite::Message;
 
 /// Largest message: the hello of 64 bones and 8 poses takes about 60 KB.
@@ -81,8 +81,11 @@ pub async fn watch(
     let layout = PacketLayout::try_from(&hello.character).map_err(|error| failed(error.to_string()))?;
     let write_error = |error: &dyn std::fmt::Display| WatchError::File { path: out.display().to_string(), problem: error.to_string() };
     let file = OpenOptions::new().write(true).create_new(true).open(out).map_err(|error| write_error(&error))?;
+    hold(&file);
     let mut writer: RecordingWriter<File> = RecordingWriter::to(file, layout).map_err(|error: RecordError| write_error(&error))?;
-    let now = || SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
+    // Looked at once: a clock that is set back meanwhile would give what follows one time.
+    let (started, begin_nanos) = (Instant::now(), unix_nanos());
+    let now = || begin_nanos.saturating_add(nanos(started.elapsed()));
     let begin = SessionEvent::Recording {
         version: VERSION,
         room: room.to_owned(),

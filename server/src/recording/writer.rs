@@ -8,7 +8,6 @@
 //! stopped machine what came since the last `fdatasync`, every [`SYNC`].
 
 use super::format::{Entry, PROFILE, SessionEvent, Topic, VERSION};
-use super::reader::{ReadError, Recording};
 use crate::metrics::Metrics;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
@@ -228,24 +227,24 @@ impl Recorder {
                     Err(told)
                 }
             };
-            // What still comes is let go, and the room told.
+            // What still comes is let go.
             drop(items);
             let file = lock(&shared.file).clone();
             match &ended {
                 Ok(()) => tracing::info!(file, "recording ended"),
                 Err(error) => {
-                    // On a full disk every publisher would leave an empty file.
-                    let path = folder.join(&file);
-                    if !file.is_empty() && matches!(Recording::open(&path), Err(ReadError::Broken { .. })) {
-                        let _ = std::fs::remove_file(&path);
-                    }
                     metrics.recording_failures.inc();
                     tracing::error!(file, error, "recording failed; the stream goes on");
                 }
             }
+            let has_failed = ended.is_err();
             // Before the room is told, so that another may begin at once.
             drop(place);
             *lock(&shared.end) = Some(ended.err().unwrap_or_default());
+            // On a full disk every publisher would leave a file of which nothing can be read. This is known without reading it.
+            if has_failed && !file.is_empty() && shared.bytes.load(Ordering::Relaxed) == 0 {
+                let _ = std::fs::remove_file(folder.join(&file));
+            }
             drop(keeps);
         };
         let thread = std::thread::Builder::new().name("recording".into());
@@ -293,13 +292,43 @@ fn create(dir: &Path, room: &RoomName) -> Result<(File, PathBuf), RecordError> {
         let suffix = if attempt == 1 { String::new() } else { format!("-{attempt}") };
         let path = dir.join(format!("{room}-{time}{suffix}.mcap"));
         match OpenOptions::new().write(true).create_new(true).open(&path) {
-            Ok(file) => return Ok((file, path)),
+            Ok(file) => {
+                hold(&file);
+                return Ok((file, path));
+            }
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
             Err(source) => return Err(RecordError::Create { path: path.display().to_string(), source }),
         }
     }
     let source = io::ErrorKind::AlreadyExists.into();
     Err(RecordError::Create { path: dir.join(format!("{room}-{time}.mcap")).display().to_string(), source })
+}
+
+/// Marks a recording's file as its holder's for as long as it is open there, also in clones of it; false where another holds it.
+/// Whoever only reads is not hindered: elsewhere than on Unix a mark would do that, so there is none.
+pub(super) fn hold(file: &File) -> bool {
+    #[cfg(unix)]
+    return !matches!(file.try_lock(), Err(std::fs::TryLockError::WouldBlock));
+    #[cfg(not(unix))]
+    {
+        let _ = file;
+        true
+    }
+}
+
+/// The room that the name of a recording says, where it is one that [`create`] gives.
+pub(crate) fn room_of_file(name: &str) -> Option<RoomName> {
+    let name = name.strip_suffix(".mcap")?;
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let name = name.rsplit_once('-').filter(|(_, number)| is_number(number)).map_or(name, |(name, _)| name);
+    let (room, stamp) = name.rsplit_once('-')?;
+    let is_stamp = stamp.len() == "20260131T235959Z".len()
+        && stamp.bytes().enumerate().all(|(at, byte)| match at {
+            8 => byte == b'T',
+            15 => byte == b'Z',
+            _ => byte.is_ascii_digit(),
+        });
+    if is_stamp { RoomName::new(room).ok() } else { None }
 }
 
 /// `20260131T235959Z`.
@@ -319,11 +348,11 @@ fn stamp(time: SystemTime) -> String {
 }
 
 /// Of the Unix clock.
-fn unix_nanos() -> u64 {
+pub(super) fn unix_nanos() -> u64 {
     nanos(SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default())
 }
 
-fn nanos(duration: Duration) -> u64 {
+pub(super) fn nanos(duration: Duration) -> u64 {
     u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX / 2)
 }
 
@@ -331,6 +360,7 @@ fn nanos(duration: Duration) -> u64 {
 #[derive(Default)]
 struct Shared {
     waiting_bytes: AtomicUsize,
+    /// Written; nothing as long as no chunk is.
     bytes: AtomicU64,
     /// Left out since the thread was last told.
     gap: AtomicU64,
@@ -681,6 +711,7 @@ fn schema_name(topic: &Topic) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::reader::Recording;
     use super::*;
 
     #[test]
@@ -751,6 +782,18 @@ mod tests {
         }
         assert!(text.contains(r#"{"event":"gap","messages":7}"#) && text.contains(r#"{"event":"stop","reason":"the file has"#), "{text}");
         std::fs::remove_dir_all(&dir).unwrap();
+    }
+
+    #[test]
+    fn recordings_are_told_by_room_though_names_begin_alike() {
+        let room = |file: &str| room_of_file(file).map(|room| room.to_string());
+        assert_eq!(room("a-20260131T235959Z.mcap").as_deref(), Some("a"));
+        assert_eq!(room("a-20260131T235959Z-12.mcap").as_deref(), Some("a"));
+        assert_eq!(room("a-b-20260131T235959Z.mcap").as_deref(), Some("a-b"));
+        assert_eq!(room("a-20260131T235959Z-20260131T235959Z.mcap").as_deref(), Some("a-20260131T235959Z"));
+        for file in ["a-.mcap", "a-20260131T235959Z-.mcap", "b.mcap", "-20260131T235959Z.mcap", "a-20260131T235959Z", "a-2.mcap"] {
+            assert_eq!(room(file), None, "{file}");
+        }
     }
 
     #[test]

@@ -23,7 +23,7 @@ pub(super) struct FedState {
     /// Epoch and index of the key packet that its deltas need.
     key: (u64, u64),
     decoder: Decoder,
-    frame: FaceFrame,
+    pub(super) frame: FaceFrame,
 }
 
 /// What became of another node's packet.
@@ -92,6 +92,7 @@ impl Rooms {
         let mut state = lock(&room.state);
         if !std::mem::replace(&mut state.is_home, true) {
             state.num_states_before = state.num_states;
+            room.end_fed(&mut state);
         }
         state.epoch = epoch;
         state.num_sessions = state.num_sessions.max(sessions);
@@ -126,12 +127,13 @@ impl Rooms {
             // Its task may have ended in this moment.
             let _ = publisher.evict.send(());
         }
+        room.end_recording_by_itself(&mut state);
         state.empty_since = Instant::now();
     }
 
-    /// Rooms that somebody watches here.
+    /// Rooms that somebody watches or records here.
     pub fn watched(&self) -> Vec<Arc<Room>> {
-        lock(&self.by_name).values().filter(|room| lock(&room.state).num_viewers > 0).cloned().collect()
+        lock(&self.by_name).values().filter(|room| lock(&room.state).is_wanted()).cloned().collect()
     }
 }
 
@@ -172,12 +174,14 @@ impl Room {
             (None, false) => return Fed::NeedsKey,
         };
         (fed.head, fed.key) = (head, key);
+        let recorded = (fed.frame.session, delta.as_ref().unwrap_or(&key_packet.bytes).clone());
         state.shown = Some((fed.frame.seq, fed.frame.captured_at_micros, fed.frame.face));
         state.num_sessions = state.num_sessions.max(fed.frame.session);
         state.epoch = head.epoch;
         state.key = Some(key_packet.clone());
         state.num_states += 1;
         self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key: key_packet, delta, json: OnceLock::new() })));
+        self.record_fed(state, recorded.0, &recorded.1);
         Fed::Taken
     }
 }

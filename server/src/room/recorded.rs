@@ -2,13 +2,35 @@
 
 use super::{Publisher, Room, RoomState, Rooms, lock};
 use crate::recording::{Item, RecordError, RecorderStatus, SessionEvent, Sink};
+use rhytid_shared::Slot;
 use std::sync::Arc;
+use std::time::Instant;
+use tokio_tungstenite::tungstenite::Bytes;
+
+/// What sources at another node are called in a recording.
+const ELSEWHERE: &str = "another node";
+
+/// What a recording says of a session whose packets it has, and no messages that they could be solved from.
+fn under_way(session: u32, slot: &str, source: &str) -> Item {
+    Item::Event(SessionEvent::Start {
+        session,
+        slot: slot.to_owned(),
+        source: source.to_owned(),
+        under_way: true,
+        kept_neutral: None,
+        profile: None,
+        solve: None,
+    })
+}
 
 impl Rooms {
     /// Begins the recording of a room that is recorded without being asked to. Waits for nothing.
     pub(super) fn record_by_itself(&self, room: &Room, state: &mut RoomState) {
         match self.recorder.start(&room.name, room.since) {
-            Ok((sink, _)) => room.begin_recording(state, sink),
+            Ok((sink, _)) => {
+                room.begin_recording(state, sink);
+                state.records_by_itself = true;
+            }
             Err(error) => {
                 self.metrics.recording_failures.inc();
                 tracing::error!(room = %room.name, %error, "the room is not recorded");
@@ -21,6 +43,11 @@ impl RoomState {
     /// True while what happens is recorded.
     pub(super) fn is_recorded(&self) -> bool {
         self.recording.as_ref().is_some_and(|sink| !sink.has_ended())
+    }
+
+    /// Somebody watches or records it here.
+    pub(super) fn is_wanted(&self) -> bool {
+        self.num_viewers > 0 || self.is_recorded()
     }
 }
 
@@ -51,27 +78,62 @@ impl Room {
             return Err(RecordError::Running);
         }
         self.begin_recording(&mut state, sink);
+        state.records_by_itself = false;
+        drop(state);
+        if let Some(interest) = &self.interest {
+            // Where its home is elsewhere, its packets are asked for.
+            interest.send_replace(());
+        }
         Ok(())
     }
 
-    /// Publishers that are there are noted as under way, with the state that their packets refer to.
+    /// Sessions that are there are noted as under way, with the state that their packets refer to.
     fn begin_recording(&self, state: &mut RoomState, sink: Arc<Sink>) {
         for Publisher { session, claim, .. } in &state.publishers {
-            let event = SessionEvent::Start {
-                session: *session,
-                slot: claim.slot.name.clone(),
-                source: claim.source.clone(),
-                under_way: true,
-                kept_neutral: None,
-                profile: None,
-                solve: None,
-            };
-            sink.put(self.nanos(), Item::Event(event));
+            sink.put(self.nanos(), under_way(*session, &claim.slot.name, &claim.source));
         }
-        if let Some(key) = state.key.as_ref().filter(|_| !state.publishers.is_empty()) {
+        let fed = state.fed.as_ref().filter(|_| !state.is_home).map(|fed| fed.frame.session);
+        if let Some(session) = fed {
+            sink.put(self.nanos(), under_way(session, Slot::MAIN, ELSEWHERE));
+        }
+        if let Some(key) = state.key.as_ref().filter(|_| !state.publishers.is_empty() || fed.is_some()) {
             sink.put(self.nanos(), Item::Packet(key.bytes.clone()));
         }
+        state.fed_session = fed.map(|session| (session, 0));
         state.recording = Some(sink);
+    }
+
+    /// Records a packet of `session` that came from the room's home at another node, where the room is recorded.
+    pub(super) fn record_fed(&self, state: &mut RoomState, session: u32, packet: &Bytes) {
+        if !state.is_recorded() {
+            return;
+        }
+        let before = state.fed_session.filter(|(before, _)| *before == session);
+        if before.is_none() {
+            self.end_fed(state);
+            self.record(state, || under_way(session, Slot::MAIN, ELSEWHERE));
+        }
+        self.record(state, || Item::Packet(packet.clone()));
+        state.fed_session = Some((session, before.map_or(0, |(_, frames)| frames) + 1));
+        // A room of which something is recorded stays, though nobody watches it here.
+        state.empty_since = Instant::now();
+    }
+
+    /// Packets of other nodes are over, for the recording: what is published here can be solved again.
+    pub(super) fn end_fed(&self, state: &mut RoomState) {
+        if let Some((session, frames)) = state.fed_session.take() {
+            self.record(state, || Item::Event(SessionEvent::End { session, frames }));
+        }
+    }
+
+    /// Ends a recording that nobody asked for: another node is the room's home now and records it as this one did. One that
+    /// somebody asked for goes on with the packets that come from there.
+    pub(super) fn end_recording_by_itself(&self, state: &mut RoomState) {
+        if state.records_by_itself
+            && let Some(sink) = state.recording.take()
+        {
+            sink.put(self.nanos(), Item::Event(SessionEvent::Stop { reason: "another node is the room's home now".into() }));
+        }
     }
 
     /// How its recording stands.

@@ -23,6 +23,7 @@ mod linux {
     mod outages;
     #[path = "../process/mod.rs"]
     mod process;
+    mod recordings;
     mod rooms;
     mod senders;
     #[path = "../process/signal.rs"]
@@ -57,6 +58,13 @@ mod linux {
             trial("own_rooms_go_on_without_nats_and_all_joins_again_when_it_is_back", outages::nats_dies),
             trial("rolling_restart_under_load_is_hardly_seen", outages::rolling_restart),
             trial("tracker_over_udp_holds_its_room_before_all_nodes", rooms::tracker_over_udp),
+            trial("recording_is_played_at_one_node_for_all", recordings::played_at_one_node_for_all),
+            trial("faces_of_another_node_are_recorded", recordings::faces_of_another_node_are_recorded),
+            trial("take_goes_on_when_its_room_moves_and_verifies", recordings::take_goes_on_when_its_room_moves),
+            trial(
+                "recording_that_nobody_asked_for_ends_where_its_room_moves",
+                recordings::recording_that_nobody_asked_for_ends_where_its_room_moves,
+            ),
             trial("password_and_certificates_of_nats_are_passed_through", admission::password_and_certificates),
             trial("credentials_of_an_account_are_passed_through", admission::credentials),
             trial("node_whose_link_is_cut_goes_on_alone_and_joins_again", outages::cut_link)

@@ -6,6 +6,8 @@ use rhytid_server::feed::Feed;
 use rhytid_server::load_character;
 use rhytid_server::recording::{Faces, Recording, export_csv, export_gltf};
 use rhytid_shared::{TrackingData, TrackingFrame};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 #[test]
 fn a_player_stops_seeks_and_goes_on() {
@@ -35,7 +37,8 @@ fn a_player_stops_seeks_and_goes_on() {
     assert!(num >= 5, "a face that stands is sent again: {num}");
     let before = served.json("GET", "/api/rooms", "")["rooms"][0]["session"].as_u64().unwrap();
     served.json("POST", "/api/rooms/demo/replay", r#"{"playing":true,"position":1.0,"speed":4.0}"#);
-    wait_until("it to go on", || status()["position"].as_f64().unwrap() > 3.0);
+    // It is told, and does it a moment later.
+    wait_until("it to go on", || (3.0..12.0).contains(&status()["position"].as_f64().unwrap()));
     let after = served.json("GET", "/api/rooms", "")["rooms"][0]["session"].as_u64().unwrap();
     assert_eq!(after, before + 1, "a jump begins a session");
     for (body, code) in [(r#"{"speed":0}"#, 400), (r#"{"position":-1}"#, 400), (r#"{"sped":1}"#, 400), (r#"{"file":"../x.mcap"}"#, 403)] {
@@ -44,6 +47,79 @@ fn a_player_stops_seeks_and_goes_on() {
     assert_eq!(served.request("POST", "/api/rooms/other/replay", r#"{"playing":true}"#).0, 409);
     served.json("DELETE", "/api/rooms/demo/replay", "");
     wait_until("the room to be free", || served.json("GET", "/api/rooms", "")["rooms"][0]["publisher"].is_null());
+}
+
+/// The one that is replaced learns of it while it has jumps to make.
+#[test]
+fn a_player_that_is_replaced_leaves_the_room_to_the_new_one() {
+    let folder = Folder::new();
+    // All of it within a second, with its messages: a jump takes longer than a request for one.
+    let first = Recorder::into(&folder);
+    assert!(first.send(&["--speed", "max"]).status.success());
+    first.end();
+    let file = folder.recording().file_name().unwrap().to_str().unwrap().to_owned();
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none"]);
+    let path = "/api/rooms/demo/replay";
+    let is_over = AtomicBool::new(false);
+    assert_eq!(served.request("POST", path, &format!(r#"{{"file":"{file}","loop":true}}"#)).0, 200);
+    let jump = |from: u32| {
+        for k in (from..).step_by(7).take_while(|_| !is_over.load(Ordering::Relaxed)) {
+            let (status, _) = served.request("POST", path, &format!(r#"{{"position":0.{:03}}}"#, k % 1000));
+            // It may have as many as it can keep in mind, or not be there yet.
+            assert!([200, 503, 409].contains(&status), "{status}");
+        }
+    };
+    let replace = || {
+        for round in 0..20 {
+            let (status, answer) = served.request("POST", path, &format!(r#"{{"file":"{file}","loop":true}}"#));
+            if status != 200 {
+                return Err(format!("round {round}: {answer}"));
+            }
+            std::thread::sleep(Duration::from_millis(50));
+            let status = &served.json("GET", path, "")["replay"];
+            if status["playing"] != true || !status["error"].is_null() {
+                return Err(format!("round {round}: {status}"));
+            }
+        }
+        Ok(())
+    };
+    let replaced = std::thread::scope(|scope| {
+        for from in 0..8 {
+            scope.spawn(move || jump(from));
+        }
+        let replaced = replace();
+        is_over.store(true, Ordering::Relaxed);
+        replaced
+    });
+    assert_eq!(replaced, Ok(()));
+    assert!(served.json("GET", "/api/rooms", "")["rooms"][0]["publisher"].is_object());
+}
+
+#[test]
+fn a_replay_that_stands_still_leaves_its_room_and_none_is_recorded_unasked() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("demo.mcap"), &character, &hello, &frames);
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--replay-timeout", "1"]);
+    let status = || served.json("GET", "/api/rooms/demo/replay", "")["replay"].clone();
+    let end = frames.last().unwrap().t;
+    served.json("POST", "/api/rooms/demo/replay", &format!(r#"{{"file":"demo.mcap","from":{}}}"#, end - 2.5));
+    wait_until("its end", || status()["playing"] == false);
+    assert!(status()["error"].is_null(), "it stands: {}", status());
+    assert_eq!(served.metric("rhytid_recordings"), 0.0, "it is a recording already");
+    // Whoever uses it keeps it there.
+    for _ in 0..3 {
+        std::thread::sleep(Duration::from_millis(600));
+        served.json("POST", "/api/rooms/demo/replay", &format!(r#"{{"position":{},"playing":false}}"#, end - 1.0));
+    }
+    wait_until("the room to be free", || served.json("GET", "/api/rooms", "")["rooms"][0]["publisher"].is_null());
+    assert!(status()["error"].as_str().unwrap().contains("stood still"), "{}", status());
+    assert_eq!(folder.files().len(), 1);
+    // Who asks for it gets it.
+    served.json("POST", "/api/rooms/demo/replay", r#"{"file":"demo.mcap"}"#);
+    served.json("POST", "/api/rooms/demo/record/start", "");
+    assert_eq!(served.metric("rhytid_recordings"), 1.0);
 }
 
 #[test]

@@ -5,6 +5,7 @@ use crate::http::ask;
 use crate::process::{Process, program};
 use crate::server::{Folder, Recorder, run, says, wait_until};
 use rhytid_server::recording::{Faces, Recording, recover};
+use std::fs::OpenOptions;
 use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -127,4 +128,57 @@ fn a_full_disk_ends_the_recording_and_not_the_stream() {
     assert!(files.iter().all(|file| std::fs::metadata(file).unwrap().len() > 0), "{files:?}");
     let report = recover(&files[0], None).unwrap();
     assert!(report.packets > 20, "{report:?}");
+}
+
+/// What stands in a file is no reason to remove it, and is not looked at: reading it could take minutes.
+#[test]
+fn a_failed_recording_is_kept_whatever_stands_in_it_unless_nothing_does() {
+    let folder = Folder::new();
+    let limited = ["sh", "-c", r#"ulimit -f 64; exec "$0" "$@""#];
+    let served = Recorder::try_start(&limited, &["serve", "--record", folder.shown()]).unwrap();
+    let sending = served.keep_sending("4.0");
+    let length = |path: &PathBuf| std::fs::metadata(path).map_or(0, |about| about.len());
+    wait_until("chunks", || folder.files().iter().any(|file| length(file) > 4000));
+    let file = folder.files().remove(0);
+    // As if the disk had lost a byte.
+    std::os::unix::fs::FileExt::write_at(&OpenOptions::new().write(true).open(&file).unwrap(), b"?", 0).unwrap();
+    wait_until("the failure", || served.metric("rhytid_recording_failures_total") >= 1.0);
+    drop(sending);
+    drop(served);
+    assert!(length(&file) > 4000, "it is still there");
+    // Nothing at all fits.
+    let folder = Folder::new();
+    let limited = ["sh", "-c", r#"ulimit -f 0; exec "$0" "$@""#];
+    let served = Recorder::try_start(&limited, &["serve", "--record", folder.shown()]).unwrap();
+    let _sending = served.keep_sending("1.0");
+    wait_until("the failure", || served.metric("rhytid_recording_failures_total") >= 1.0);
+    wait_until("an empty folder", || folder.files().is_empty());
+}
+
+#[test]
+fn a_recording_is_not_mended_while_it_is_written_and_a_killed_mending_may_be_done_again() {
+    let folder = Folder::new();
+    let served = Recorder::into(&folder);
+    let sending = served.keep_sending("1.0");
+    wait_until("frames", || served.metric("rhytid_frames_in_total") > 40.0);
+    let path = folder.recording();
+    let shown = path.to_str().unwrap();
+    let refused = run(&["recover", shown]);
+    assert!(!refused.status.success() && says(&refused).contains("is still being written"), "{}", says(&refused));
+    let copy = folder.path("copy");
+    let copied = run(&["recover", shown, "--out", copy.to_str().unwrap()]);
+    assert!(copied.status.success(), "what stands in it so far may be had: {}", says(&copied));
+    let before = served.metric("rhytid_recorded_bytes_total");
+    wait_until("more of it", || served.metric("rhytid_recorded_bytes_total") > before + 1000.0);
+    assert!(std::fs::metadata(&path).unwrap().len() as f64 > before, "it is the file that is written");
+    drop(served);
+    drop(sending);
+    // A mending that was killed has left this.
+    let left = folder.path(&format!("{}.mended", path.file_name().unwrap().to_str().unwrap()));
+    std::fs::write(&left, vec![7; 100_000]).unwrap();
+    let mended = run(&["recover", shown]);
+    assert!(mended.status.success() && says(&mended).contains("kept "), "{}", says(&mended));
+    assert!(!left.exists());
+    let verified = run(&["verify", shown]);
+    assert!(verified.status.success(), "{}", says(&verified));
 }
