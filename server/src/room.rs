@@ -158,6 +158,8 @@ struct RoomState {
     is_home: bool,
     /// Epoch under which packets leave for other nodes; what comes under an older one is old.
     epoch: u64,
+    /// NATS has recorded that epoch: packets under one that it has not would shut out those of the true home.
+    is_shared: bool,
     /// States that came before this node was the room's home: they are of another epoch.
     num_states_before: u64,
     /// What came from another node.
@@ -297,6 +299,7 @@ impl Rooms {
                 empty_since: Instant::now(),
                 is_home: self.others.is_none(),
                 epoch: 0,
+                is_shared: false,
                 num_states_before: 0,
                 fed: None,
             }),
@@ -429,7 +432,7 @@ impl Publishing {
         };
         state.key = Some(key.clone());
         state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
-        if let Some(outlet) = &self.room.outlet {
+        if let Some(outlet) = self.room.outlet.as_ref().filter(|_| state.is_shared) {
             let head = StateHead { epoch: state.epoch, index, key_index: key.index };
             if !outlet.send(&self.room.name, head, &state.packet) {
                 self.room.metrics.drop_frames("slow_cluster", 1);

@@ -254,7 +254,7 @@ impl Cluster {
     }
 
     fn hold(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: Option<u64>, sessions: u32) {
-        rooms.lead(room, lease.epoch, sessions);
+        rooms.lead(room, lease.epoch, revision.is_some(), sessions);
         tracing::info!(%room, epoch = lease.epoch, shared = revision.is_some(), "home of a room");
         lock(&self.held).insert(room.clone(), Held { lease, revision, empty_since: None });
     }
@@ -330,7 +330,7 @@ impl Cluster {
     /// What was held alone is held before all.
     fn confirm(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: u64) {
         if let Some(held) = lock(&self.held).get_mut(room) {
-            rooms.lead(room, lease.epoch, 0);
+            rooms.lead(room, lease.epoch, true, 0);
             tracing::info!(%room, epoch = lease.epoch, "home of a room before all nodes");
             (held.lease, held.revision) = (lease, Some(revision));
         }
@@ -373,6 +373,8 @@ impl Cluster {
             };
             if is_lost {
                 self.lose(&rooms, &room, lease.epoch);
+            } else if lease.node != self.node {
+                rooms.follow(&room, lease.epoch);
             }
             lock(&self.leases).insert(room, lease);
             self.homes.send_replace(());

@@ -1,6 +1,6 @@
 //! Rooms among nodes: which of them is a room's home, what goes to the others and what comes from them.
 
-use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, Rooms, lock};
+use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomState, Rooms, lock};
 use crate::cluster::{Kept, Outlet, StateHead};
 use rhytid_shared::packet::{Decoder, PacketKind};
 use rhytid_shared::{FaceFrame, RoomName};
@@ -86,15 +86,25 @@ impl Rooms {
         })
     }
 
-    /// This node is a room's home from now on, under `epoch`; others may have had `sessions` sessions of it.
-    pub fn lead(&self, name: &RoomName, epoch: u64, sessions: u32) {
+    /// This node is a room's home from now on, under `epoch`, which others know of where it `is_shared`; they may have had
+    /// `sessions` sessions of it.
+    pub fn lead(&self, name: &RoomName, epoch: u64, is_shared: bool, sessions: u32) {
         let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
         let mut state = lock(&room.state);
         if !std::mem::replace(&mut state.is_home, true) {
             state.num_states_before = state.num_states;
         }
-        state.epoch = epoch;
+        (state.epoch, state.is_shared) = (epoch, is_shared);
         state.num_sessions = state.num_sessions.max(sessions);
+    }
+
+    /// Another node is a room's home under `epoch`: what was shown under a greater one came from a node that was none.
+    pub fn follow(&self, name: &RoomName, epoch: u64) {
+        let Some(room) = self.find(name) else { return };
+        let mut state = lock(&room.state);
+        if !state.is_home && state.epoch > epoch {
+            state.follow(epoch);
+        }
     }
 
     /// This node is a room's home no longer, unless somebody publishes to it.
@@ -114,10 +124,7 @@ impl Rooms {
         state.is_home = false;
         if let Some(epoch) = epoch {
             // Where both were cut off from each other, this one's may be the greater.
-            state.epoch = epoch;
-            if state.fed.as_ref().is_some_and(|fed| fed.head.epoch > epoch) {
-                state.fed = None;
-            }
+            state.follow(epoch);
         }
         for publisher in std::mem::take(&mut state.publishers) {
             room.record(&state, || publisher.end());
@@ -132,6 +139,16 @@ impl Rooms {
     /// Rooms that somebody watches here.
     pub fn watched(&self) -> Vec<Arc<Room>> {
         lock(&self.by_name).values().filter(|room| lock(&room.state).num_viewers > 0).cloned().collect()
+    }
+}
+
+impl RoomState {
+    /// Takes packets from `epoch` on.
+    fn follow(&mut self, epoch: u64) {
+        self.epoch = epoch;
+        if self.fed.as_ref().is_some_and(|fed| fed.head.epoch > epoch) {
+            self.fed = None;
+        }
     }
 }
 

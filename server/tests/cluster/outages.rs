@@ -131,6 +131,53 @@ pub fn nats_dies() {
     assert_eq!((sessions.len(), num_twice(&near), num_twice(&far.finish())), (1, 0, 0));
 }
 
+/// Two nodes open one room while NATS is away; the viewer at a third one sees the one that keeps it, and never the other.
+pub fn two_homes() {
+    let mut cluster = Cluster::start();
+    let folder = cluster.folder.clone();
+    let feed = write_feed(folder.path(), 60);
+    let (a, b, c) = (&cluster.nodes[0], &cluster.nodes[1], &cluster.nodes[2]);
+    let _sender = send(&feed, &[&a.address], "demo", &folder.path().join("send.log"));
+    let (demo, fresh) = (Watch::start(&[&c.address], "demo"), Watch::start(&[&c.address], "fresh"));
+    demo.wait_for_more("a face elsewhere");
+    cluster.nats.kill();
+    for node in [a, b, c] {
+        wait_for("the health to tell it", || node.get("/healthz").unwrap().starts_with("degraded").then_some(()));
+    }
+    // One room was the first node's before, the other is nobody's.
+    let mut second_demo = b.publisher("demo", HELLO).ready();
+    let mut two = [a, b].map(|node| node.publisher("fresh", HELLO).ready());
+    second_demo.frame(0.3);
+    two.iter_mut().for_each(|publisher| publisher.frame(0.3));
+    cluster.nats.restart();
+    let start = Instant::now();
+    let has_lost = |node: &Node, room: &str| node.log().lines().any(|line| line.contains("home now") && line.contains(room));
+    // They go on sending, so that a loser's packets would be seen.
+    wait_for("one home for each room", || {
+        second_demo.try_frame(0.4);
+        two.iter_mut().for_each(|publisher| drop(publisher.try_frame(0.4)));
+        std::thread::sleep(Duration::from_millis(10));
+        (has_lost(b, "demo") && (has_lost(a, "fresh") || has_lost(b, "fresh"))).then_some(())
+    });
+    println!("two homes: each room has one after {:?}", start.elapsed());
+    assert!(!has_lost(a, "demo"), "the node that had it before keeps it");
+    let kept = usize::from(has_lost(a, "fresh"));
+    for loser in [&mut second_demo, &mut two[1 - kept]] {
+        let told = loser.last_answer();
+        assert_eq!(told["code"], "taken_over", "{told}");
+    }
+    let before = Instant::now();
+    wait_for("the face elsewhere", || {
+        two[kept].frame(0.5);
+        let is_seen = |watch: &Watch| watch.last().is_some_and(|seen| seen.at > before);
+        (is_seen(&demo) && is_seen(&fresh)).then_some(())
+    });
+    let sessions = demo.finish().iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();
+    assert_eq!(sessions.len(), 1, "the other's packets went nowhere: {sessions:?}");
+    let sessions = fresh.finish().iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();
+    assert_eq!(sessions.len(), 1, "the loser's packets went nowhere: {sessions:?}");
+}
+
 pub fn rolling_restart() {
     let mut cluster = Cluster::start();
     let addresses: Vec<String> = cluster.nodes.iter().map(|node| node.address.clone()).collect();
