@@ -142,6 +142,8 @@ struct Held {
     lease: Lease,
     /// Of its record; `None` where NATS was not to be had, or has come back, and it has yet to be claimed.
     revision: Option<u64>,
+    /// When its record was written.
+    renewed: Instant,
     /// Since when its room has had no publisher.
     empty_since: Option<Instant>,
 }

@@ -20,6 +20,8 @@ const EMPTY_FOR: Duration = Duration::from_secs(2);
 const SESSIONS_AT_ONCE: u32 = 1000;
 /// A home that has so few of them left takes more.
 const SESSIONS_LEFT: u32 = 200;
+/// A lease is written again after this long: NATS forgets what is older than a day.
+const RENEWED_AFTER: Duration = Duration::from_secs(3600);
 /// How long a home that does not answer may just be slow: only one who wants back what it had does not wait.
 const SLOW: Duration = Duration::from_secs(2);
 /// Between questions to a home that does not answer.
@@ -86,6 +88,19 @@ fn now_millis() -> u64 {
 /// NATS's answer, or `None` where it takes too long.
 async fn within<T>(answer: impl Future<Output = T>) -> Option<T> {
     tokio::time::timeout(REQUEST_TIMEOUT, answer).await.ok()
+}
+
+impl Held {
+    /// Its room has had no publisher for long enough.
+    fn is_empty(&self, now: Instant) -> bool {
+        self.empty_since.is_some_and(|since| now.saturating_duration_since(since) >= EMPTY_FOR)
+    }
+
+    /// It is to be given back, claimed, or written again; `num_sessions` of its room have been.
+    fn is_due(&self, num_sessions: u32, now: Instant) -> bool {
+        let is_short = num_sessions.saturating_add(SESSIONS_LEFT) > self.lease.sessions;
+        self.is_empty(now) || self.revision.is_none() || is_short || now.saturating_duration_since(self.renewed) >= RENEWED_AFTER
+    }
 }
 
 impl Cluster {
@@ -256,7 +271,7 @@ impl Cluster {
     fn hold(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: Option<u64>, sessions: u32) {
         rooms.lead(room, lease.epoch, revision.is_some(), sessions);
         tracing::info!(%room, epoch = lease.epoch, shared = revision.is_some(), "home of a room");
-        lock(&self.held).insert(room.clone(), Held { lease, revision, empty_since: None });
+        lock(&self.held).insert(room.clone(), Held { lease, revision, renewed: Instant::now(), empty_since: None });
     }
 
     /// Gives back what has no publisher any more, and claims what could not be claimed before.
@@ -267,8 +282,7 @@ impl Cluster {
             for (room, held) in held.iter_mut() {
                 let is_empty = rooms.slots(room).is_empty();
                 held.empty_since = if is_empty { Some(held.empty_since.unwrap_or_else(Instant::now)) } else { None };
-                let is_short = rooms.num_sessions(room).saturating_add(SESSIONS_LEFT) > held.lease.sessions;
-                if held.empty_since.is_some_and(|since| since.elapsed() >= EMPTY_FOR) || held.revision.is_none() || is_short {
+                if held.is_due(rooms.num_sessions(room), Instant::now()) {
                     due.push((room.clone(), held.clone()));
                 }
             }
@@ -280,7 +294,7 @@ impl Cluster {
 
     async fn renew_one(&self, rooms: &Rooms, room: &RoomName, held: Held) {
         let Some(buckets) = self.buckets.get() else { return };
-        if held.empty_since.is_some_and(|since| since.elapsed() >= EMPTY_FOR) {
+        if held.is_empty(Instant::now()) {
             if rooms.give_up(room) {
                 lock(&self.held).remove(room);
                 self.give_back(rooms, room, &held).await;
@@ -289,11 +303,16 @@ impl Cluster {
         }
         if let Some(revision) = held.revision {
             let lease = Lease { sessions: rooms.num_sessions(room).wrapping_add(SESSIONS_AT_ONCE), ..held.lease };
-            // Who has taken it meanwhile is heard of by the watch.
-            if let Some(Ok(revision)) = within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await
-                && let Some(held) = lock(&self.held).get_mut(room)
-            {
-                (held.lease, held.revision) = (lease, Some(revision));
+            let renewed = within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await;
+            let mut held = lock(&self.held);
+            // Who has taken it meanwhile is heard of by the watch, too.
+            let Some(held) = held.get_mut(room).filter(|held| held.revision == Some(revision)) else { return };
+            match renewed {
+                Some(Ok(revision)) => (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now()),
+                // Its record is another, or is gone: it is claimed anew.
+                Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => held.revision = None,
+                Some(Err(error)) => tracing::debug!(%room, %error, "lease not renewed"),
+                None => tracing::debug!(%room, "lease not renewed: no answer"),
             }
             return;
         }
@@ -332,7 +351,7 @@ impl Cluster {
         if let Some(held) = lock(&self.held).get_mut(room) {
             rooms.lead(room, lease.epoch, true, 0);
             tracing::info!(%room, epoch = lease.epoch, "home of a room before all nodes");
-            (held.lease, held.revision) = (lease, Some(revision));
+            (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now());
         }
     }
 
@@ -365,6 +384,10 @@ impl Cluster {
             let lease: Option<Lease> = if entry.operation == Operation::Put { serde_json::from_slice(&entry.value).ok() } else { None };
             let Some(lease) = lease else {
                 lock(&self.leases).remove(&room);
+                // Not by a node: then who holds it claims it anew.
+                if let Some(held) = lock(&self.held).get_mut(&room).filter(|held| held.revision.is_some_and(|own| own < entry.revision)) {
+                    held.revision = None;
+                }
                 continue;
             };
             let is_lost = {
@@ -405,4 +428,24 @@ impl Cluster {
 
 fn text_of(lease: &Lease) -> Bytes {
     serde_json::to_vec(lease).expect("plain data can be written").into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::KEPT_FOR;
+    use super::*;
+
+    #[test]
+    fn lease_is_written_again_long_before_nats_forgets_it() {
+        let now = Instant::now();
+        let lease = Lease { sessions: 1000, ..Lease::default() };
+        let held = Held { lease, revision: Some(1), renewed: now, empty_since: None };
+        let half_an_hour = now + Duration::from_secs(1800);
+        assert!(!held.is_due(800, half_an_hour));
+        assert!(held.is_due(801, half_an_hour), "few sessions are left");
+        assert!(held.is_due(0, now + KEPT_FOR / 12));
+        assert!(Held { revision: None, ..held.clone() }.is_due(0, now));
+        let empty = Held { empty_since: Some(now), ..held };
+        assert!(!empty.is_due(0, now + EMPTY_FOR / 2) && empty.is_due(0, now + EMPTY_FOR));
+    }
 }

@@ -7,6 +7,7 @@ use super::process::{Process, wait_for};
 use super::senders::{send, write_feed};
 use super::signal::{Signal, signal};
 use super::watch::{Watch, num_twice, pause};
+use futures_util::TryStreamExt;
 use serde_json::Value;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -176,6 +177,30 @@ pub fn two_homes() {
     assert_eq!(sessions.len(), 1, "the other's packets went nowhere: {sessions:?}");
     let sessions = fresh.finish().iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();
     assert_eq!(sessions.len(), 1, "the loser's packets went nowhere: {sessions:?}");
+}
+
+/// A lease vanishes from NATS while its home lives.
+pub fn lost_lease() {
+    let cluster = Cluster::start();
+    let [a, b, _] = &cluster.nodes[..] else { unreachable!() };
+    let mut publisher = a.publisher("demo", HELLO).ready();
+    let num_claimed = || a.log().lines().filter(|line| line.contains("home of a room") && line.contains("demo")).count();
+    wait_for("the lease", || (num_claimed() == 1).then_some(()));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let jetstream = async_nats::jetstream::new(async_nats::connect(cluster.nats.url()).await.unwrap());
+        let bucket = jetstream.stream_names().try_filter(|name| std::future::ready(name.ends_with("_leases")));
+        let [bucket] = &bucket.try_collect::<Vec<_>>().await.unwrap()[..] else { panic!("one bucket of leases") };
+        let leases = jetstream.get_key_value(bucket.strip_prefix("KV_").unwrap()).await.unwrap();
+        leases.purge("demo").await.unwrap();
+    });
+    wait_for("another claim", || (num_claimed() == 2).then_some(()));
+    let refused = b.publisher("demo", HELLO).answer();
+    assert_eq!(refused["code"], "room_taken", "{refused}");
+    publisher.frame(0.3);
+    let mut viewer = b.viewer("demo");
+    publisher.frame(0.4);
+    viewer.packet();
 }
 
 pub fn rolling_restart() {
