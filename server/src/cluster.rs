@@ -170,6 +170,7 @@ pub(crate) struct Cluster {
     connections: Arc<Connections>,
     /// Which connection the buckets and leases have been looked at through, and since when.
     joined: watch::Sender<(u64, Instant)>,
+    started: Instant,
     node: String,
     address: String,
     replicas: usize,
@@ -260,6 +261,7 @@ impl Cluster {
             client,
             connections,
             joined: watch::Sender::new((0, Instant::now())),
+            started: Instant::now(),
             outbound: Mutex::new(Some(outbound)),
             outlet: Outlet(outlet),
             buckets: OnceLock::new(),
@@ -303,8 +305,9 @@ impl Cluster {
     /// The connection is so fresh that others may not be back yet.
     fn is_gathering(&self) -> bool {
         let (connection, since) = *self.joined.borrow();
-        // The first one is as old as this node, and no sign that the others have lost theirs.
-        connection > 1 && since.elapsed() < GATHERING
+        // The first one is as old as this node, and no sign that the others have lost theirs, unless NATS was away meanwhile.
+        let may_be_lost = connection > 1 || since.saturating_duration_since(self.started) > FIRST_JOIN;
+        may_be_lost && since.elapsed() < GATHERING
     }
 
     /// Waits until the node has joined, but not for long.

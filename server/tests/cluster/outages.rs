@@ -179,6 +179,29 @@ pub fn two_homes() {
     assert_eq!(sessions.len(), 1, "the loser's packets went nowhere: {sessions:?}");
 }
 
+/// A node starts while NATS is away and opens a room that lives; when NATS is back, it is there before the room's home is.
+pub fn late_node() {
+    let mut nats = Nats::start();
+    let a = Node::start(&nats.url()).ready();
+    let mut publisher = a.publisher("demo", HELLO).ready();
+    nats.kill();
+    let late = Node::start(&nats.url());
+    let mut other = late.publisher("demo", HELLO).ready();
+    signal(&a.process, Signal::STOP);
+    nats.restart();
+    wait_for("the late node's joining", || (late.get("/healthz").unwrap() == "ok\n").then_some(()));
+    // Some rounds in which it asks who does not answer.
+    std::thread::sleep(Duration::from_millis(1200));
+    signal(&a.process, Signal::CONT);
+    let told = other.last_answer();
+    assert_eq!(told["code"], "taken_over", "{told}");
+    publisher.frame(0.3);
+    let mut viewer = late.viewer("demo");
+    publisher.frame(0.4);
+    viewer.packet();
+    assert!(!a.log().contains("another node is the room's home now"));
+}
+
 /// A lease vanishes from NATS while its home lives.
 pub fn lost_lease() {
     let cluster = Cluster::start();
