@@ -27,6 +27,7 @@ use tokio::sync::{Notify, mpsc, watch};
 use tokio_tungstenite::tungstenite::Bytes;
 
 use lease::Entering;
+pub(crate) use lease::LeaseError;
 use wire::{EnterAnswer, EnterQuestion, LISTED_AT_ONCE, Lease, MOST_LISTED, NodeListing};
 pub(crate) use wire::{Kept, StateHead};
 

@@ -271,13 +271,18 @@ impl Rooms {
         self.find_or_make(&mut lock(&self.by_name), name)
     }
 
+    fn check_place(&self, by_name: &BTreeMap<RoomName, Arc<Room>>) -> Result<(), RoomError> {
+        if by_name.len() >= self.max_rooms {
+            return Err(RoomError::TooManyRooms { most: self.max_rooms });
+        }
+        Ok(())
+    }
+
     fn find_or_make(&self, by_name: &mut BTreeMap<RoomName, Arc<Room>>, name: &RoomName) -> Result<Arc<Room>, RoomError> {
         if let Some(room) = by_name.get(name) {
             return Ok(room.clone());
         }
-        if by_name.len() >= self.max_rooms {
-            return Err(RoomError::TooManyRooms { most: self.max_rooms });
-        }
+        self.check_place(by_name)?;
         let layout = PacketLayout::from(&*self.character);
         let room = Arc::new(Room {
             since: Instant::now(),
@@ -318,9 +323,9 @@ impl Rooms {
         lock(&self.by_name).get(name).cloned()
     }
 
-    /// What the room keeps for the slot of `hello`, of its tracker.
+    /// What the room keeps for the slot of `hello`, of its tracker, where it asks for that.
     pub fn kept(&self, name: &RoomName, hello: &PublishHello) -> Option<Kept> {
-        let room = self.find(name)?;
+        let room = self.find(name).filter(|_| hello.keep_neutral)?;
         let state = lock(&room.state);
         state.neutrals.get(&hello.slot.name).filter(|neutral| neutral.kept.tracker == hello.tracker()).map(|neutral| neutral.kept.clone())
     }

@@ -138,10 +138,10 @@ mod tests {
     #[test]
     fn what_comes_twice_late_or_under_an_older_epoch_is_not_shown() {
         let (home, mut outbound, layout) = node();
-        home.lead(&name(), 7, true, 0);
+        home.lead(&name(), 7, true, 0).unwrap();
         let _first = publish(&home, &layout, 3);
         let packets = sent(&mut outbound);
-        home.lead(&name(), 8, true, 1000);
+        home.lead(&name(), 8, true, 1000).unwrap();
         let _second = publish(&home, &layout, 1);
         let newer = sent(&mut outbound);
 
@@ -159,10 +159,10 @@ mod tests {
     #[test]
     fn nothing_leaves_under_an_epoch_that_others_do_not_know() {
         let (home, mut outbound, layout) = node();
-        home.lead(&name(), 7, false, 0);
+        home.lead(&name(), 7, false, 0).unwrap();
         let place = publish(&home, &layout, 2);
         assert!(sent(&mut outbound).is_empty());
-        home.lead(&name(), 8, true, 0);
+        home.lead(&name(), 8, true, 0).unwrap();
         assert!(place.publish(&FaceFrame { session: place.session, seq: 2, ..layout.frame_at_rest() }, None));
         assert_eq!(sent(&mut outbound)[0].0.epoch, 8);
     }
@@ -170,10 +170,10 @@ mod tests {
     #[test]
     fn node_that_was_no_home_does_not_shut_out_the_one_that_is() {
         let (home, mut outbound, layout) = node();
-        home.lead(&name(), 9, true, 0);
+        home.lead(&name(), 9, true, 0).unwrap();
         let _first = publish(&home, &layout, 1);
         let false_packet = sent(&mut outbound).remove(0);
-        home.lead(&name(), 7, true, 1000);
+        home.lead(&name(), 7, true, 1000).unwrap();
         let _second = publish(&home, &layout, 1);
         let packet = sent(&mut outbound).remove(0);
 
@@ -188,7 +188,7 @@ mod tests {
     #[test]
     fn what_cannot_be_read_goes_no_further_and_ends_nobody() {
         let (home, mut outbound, layout) = node();
-        home.lead(&name(), 7, true, 0);
+        home.lead(&name(), 7, true, 0).unwrap();
         let _place = publish(&home, &layout, 2);
         let packets = sent(&mut outbound);
         let (other, ..) = node();
@@ -208,7 +208,7 @@ mod tests {
     #[test]
     fn fresh_home_does_not_tell_what_it_was_told_as_its_own() {
         let (home, mut outbound, layout) = node();
-        home.lead(&name(), 7, true, 0);
+        home.lead(&name(), 7, true, 0).unwrap();
         let _place = publish(&home, &layout, 2);
         let (next, ..) = node();
         let viewing = next.join(&name()).unwrap();
@@ -216,7 +216,7 @@ mod tests {
             viewing.room.feed(head, packet);
         }
         assert!(next.newest(&name()).is_empty(), "it is not the home");
-        next.lead(&name(), 8, true, 1000);
+        next.lead(&name(), 8, true, 1000).unwrap();
         assert!(next.newest(&name()).is_empty(), "nothing was published here yet");
         let place = publish(&next, &layout, 2);
         assert!(place.session > 1000);
@@ -235,7 +235,7 @@ mod tests {
         let (rooms, _outbound, layout) = node();
         let claim = |resume| rooms.claim(&name(), SlotClaim { resume, ..SlotClaim::default() }, mpsc::channel(1).0, |_| Vec::new());
         assert_eq!(claim(None).err(), Some(RoomError::Elsewhere), "the room's home is not here");
-        rooms.lead(&name(), 7, true, 0);
+        rooms.lead(&name(), 7, true, 0).unwrap();
         let first = publish(&rooms, &layout, 1);
         assert_eq!(claim(Some(first.session + 1)).err(), Some(RoomError::Taken));
         let (second, _evicted) = claim(Some(first.session)).unwrap();

@@ -1,8 +1,8 @@
 //! Leases: which node is a room's home.
 
-use super::wire::{EnterAnswer, EnterQuestion, Lease};
+use super::wire::{EnterAnswer, EnterQuestion, Kept, Lease};
 use super::{Cluster, GATHERING, Held, REQUEST_TIMEOUT, lock};
-use crate::room::Rooms;
+use crate::room::{RoomError, Rooms};
 use async_nats::RequestErrorKind;
 use async_nats::jetstream::kv::{CreateErrorKind, Operation, UpdateErrorKind};
 use futures_util::StreamExt;
@@ -46,6 +46,9 @@ pub(crate) enum LeaseError {
     /// NATS does not answer as it should.
     #[error("the cluster does not answer: {0}")]
     Cluster(String),
+    /// It has no place here.
+    #[error(transparent)]
+    Room(#[from] RoomError),
     /// The service ends.
     #[error("this node is shutting down")]
     Leaving,
@@ -58,6 +61,7 @@ impl LeaseError {
             Self::Taken => "room_taken",
             Self::Elsewhere { .. } => "room_elsewhere",
             Self::Cluster(_) => "cluster",
+            Self::Room(error) => error.code(),
             Self::Leaving => "shutting_down",
         }
     }
@@ -104,9 +108,19 @@ impl Held {
 }
 
 impl Cluster {
-    /// Makes this node the home of `room` for the publisher of `hello`, with what the cluster keeps of its slot; or says whose it
-    /// is. Without NATS this node is it at once, until others can be asked.
-    pub async fn enter(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Result<(), LeaseError> {
+    /// What a publisher of `hello` finds kept of its slot where it asks for that: here, if this is the room's home, else in the
+    /// cluster.
+    pub async fn find_kept(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Option<Kept> {
+        let here = rooms.kept(room, hello);
+        if !hello.keep_neutral || self.is_home(room) && here.is_some() {
+            return here;
+        }
+        self.kept(room, &hello.slot.name).await.or(here)
+    }
+
+    /// Makes this node the home of `room` for the publisher of `hello`, with what is `kept` of its slot; or says whose it is.
+    /// Without NATS this node is it at once, until others can be asked.
+    pub async fn enter(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello, kept: Option<Kept>) -> Result<(), LeaseError> {
         if self.is_leaving.load(Ordering::SeqCst) {
             return Err(LeaseError::Leaving);
         }
@@ -119,13 +133,11 @@ impl Cluster {
             None => true,
         };
         if is_new {
+            rooms.has_place(room)?;
             self.claim(rooms, room, hello).await?;
         }
         let slot = &hello.slot.name;
-        if hello.keep_neutral
-            && (is_new || !rooms.has_kept(room, slot))
-            && let Some(kept) = self.kept(room, slot).await
-        {
+        if let Some(kept) = kept.filter(|_| is_new || !rooms.has_kept(room, slot)) {
             rooms.restore(room, slot, kept);
         }
         Ok(())
@@ -151,7 +163,8 @@ impl Cluster {
         entering.insert(room.clone(), Entering::Asked);
         let (cluster, rooms, room, hello) = (self.clone(), rooms.clone(), room.clone(), hello.clone());
         tokio::spawn(async move {
-            let entered = cluster.enter(&rooms, &room, &hello).await;
+            let kept = cluster.find_kept(&rooms, &room, &hello).await;
+            let entered = cluster.enter(&rooms, &room, &hello, kept).await;
             let mut entering = lock(&cluster.entering);
             match entered {
                 Ok(()) => drop(entering.remove(&room)),
@@ -166,8 +179,7 @@ impl Cluster {
 
     async fn claim(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Result<(), LeaseError> {
         let Some(buckets) = self.buckets.get().filter(|_| self.problem().is_none()) else {
-            self.hold_alone(rooms, room);
-            return Ok(());
+            return self.hold_alone(rooms, room);
         };
         let question = EnterQuestion { room: room.to_string(), takeover: hello.takeover, resume: hello.resume };
         for _ in 0..MOST_TRIES {
@@ -175,10 +187,7 @@ impl Cluster {
                 Some(Ok(entry)) => entry,
                 Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
                 // NATS has gone in this moment.
-                None => {
-                    self.hold_alone(rooms, room);
-                    return Ok(());
-                }
+                None => return self.hold_alone(rooms, room),
             };
             let found = entry.filter(|entry| entry.operation == Operation::Put);
             let found = found.and_then(|entry| Some((entry.revision, serde_json::from_slice::<Lease>(&entry.value).ok()?)));
@@ -193,24 +202,23 @@ impl Cluster {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => continue,
                     Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                    None => {
-                        self.hold_alone(rooms, room);
-                        return Ok(());
-                    }
+                    None => return self.hold_alone(rooms, room),
                 },
                 None => match within(buckets.leases.create(room.as_str(), text_of(&lease))).await {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == CreateErrorKind::AlreadyExists => continue,
                     Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                    None => {
-                        self.hold_alone(rooms, room);
-                        return Ok(());
-                    }
+                    None => return self.hold_alone(rooms, room),
                 },
             };
             rooms.forget_kept(room);
-            self.hold(rooms, room, lease, Some(revision), first);
-            return Ok(());
+            return match self.hold(rooms, room, lease.clone(), Some(revision), first) {
+                Ok(()) => Ok(()),
+                Err(error) => {
+                    self.give_back(rooms, room, &lease, Some(revision)).await;
+                    Err(error)
+                }
+            };
         }
         Err(LeaseError::Taken)
     }
@@ -258,20 +266,21 @@ impl Cluster {
     }
 
     /// Makes this node a room's home without asking anybody.
-    fn hold_alone(&self, rooms: &Rooms, room: &RoomName) {
+    fn hold_alone(&self, rooms: &Rooms, room: &RoomName) -> Result<(), LeaseError> {
         use std::hash::{BuildHasher, Hasher};
         let before = lock(&self.leases).get(room).cloned().unwrap_or_default();
         // Another node may do the same in this moment; their sessions shall not have the same numbers.
         let at_random = std::collections::hash_map::RandomState::new().build_hasher().finish() % 10_000;
         let first = before.sessions.max(rooms.num_sessions(room)).wrapping_add(SESSIONS_AT_ONCE * (1 + at_random as u32));
         let lease = self.own_lease(now_millis().max(before.epoch + 1), first.wrapping_add(SESSIONS_AT_ONCE));
-        self.hold(rooms, room, lease, None, first);
+        self.hold(rooms, room, lease, None, first)
     }
 
-    fn hold(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: Option<u64>, sessions: u32) {
-        rooms.lead(room, lease.epoch, revision.is_some(), sessions);
+    fn hold(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: Option<u64>, sessions: u32) -> Result<(), LeaseError> {
+        rooms.lead(room, lease.epoch, revision.is_some(), sessions)?;
         tracing::info!(%room, epoch = lease.epoch, shared = revision.is_some(), "home of a room");
         lock(&self.held).insert(room.clone(), Held { lease, revision, renewed: Instant::now(), empty_since: None });
+        Ok(())
     }
 
     /// Gives back what has no publisher any more, and claims what could not be claimed before.
@@ -297,7 +306,7 @@ impl Cluster {
         if held.is_empty(Instant::now()) {
             if rooms.give_up(room) {
                 lock(&self.held).remove(room);
-                self.give_back(rooms, room, &held).await;
+                self.give_back(rooms, room, &held.lease, held.revision).await;
             }
             return;
         }
@@ -349,15 +358,19 @@ impl Cluster {
     /// What was held alone is held before all.
     fn confirm(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: u64) {
         if let Some(held) = lock(&self.held).get_mut(room) {
-            rooms.lead(room, lease.epoch, true, 0);
+            if let Err(error) = rooms.lead(room, lease.epoch, true, 0) {
+                return tracing::warn!(%room, %error, "it is not there any more");
+            }
             tracing::info!(%room, epoch = lease.epoch, "home of a room before all nodes");
             (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now());
         }
     }
 
-    async fn give_back(&self, rooms: &Rooms, room: &RoomName, held: &Held) {
-        let (Some(buckets), Some(revision)) = (self.buckets.get(), held.revision) else { return };
-        let free = Lease { node: String::new(), address: String::new(), sessions: rooms.num_sessions(room), epoch: held.lease.epoch };
+    async fn give_back(&self, rooms: &Rooms, room: &RoomName, lease: &Lease, revision: Option<u64>) {
+        let (Some(buckets), Some(revision)) = (self.buckets.get(), revision) else { return };
+        // As many as may have been, where there is no such room any more.
+        let sessions = rooms.num_sessions(room).max(lease.sessions.saturating_sub(SESSIONS_AT_ONCE));
+        let free = Lease { node: String::new(), address: String::new(), sessions, epoch: lease.epoch };
         match within(buckets.leases.update(room.as_str(), text_of(&free), revision)).await {
             Some(Ok(_)) => {}
             // Another has taken it meanwhile, or finds that nobody answers for it.
@@ -419,7 +432,7 @@ impl Cluster {
     pub async fn leave(&self, rooms: &Rooms) {
         self.is_leaving.store(true, Ordering::SeqCst);
         let all: Vec<_> = lock(&self.held).drain().collect();
-        let giving = all.iter().map(|(room, held)| self.give_back(rooms, room, held));
+        let giving = all.iter().map(|(room, held)| self.give_back(rooms, room, &held.lease, held.revision));
         let giving = futures_util::stream::iter(giving).buffer_unordered(64).collect::<()>();
         // Whoever comes for the rest finds that nobody answers.
         let _ = tokio::time::timeout(Duration::from_secs(1), giving).await;

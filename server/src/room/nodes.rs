@@ -1,6 +1,6 @@
 //! Rooms among nodes: which of them is a room's home, what goes to the others and what comes from them.
 
-use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomState, Rooms, lock};
+use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomError, RoomState, Rooms, lock};
 use crate::cluster::{Kept, Outlet, StateHead};
 use rhytid_shared::packet::{Decoder, PacketKind};
 use rhytid_shared::{FaceFrame, RoomName};
@@ -40,6 +40,12 @@ pub(crate) enum Fed {
 }
 
 impl Rooms {
+    /// Whether there is a room of this name, or could be.
+    pub fn has_place(&self, name: &RoomName) -> Result<(), RoomError> {
+        let by_name = lock(&self.by_name);
+        if by_name.contains_key(name) { Ok(()) } else { self.check_place(&by_name) }
+    }
+
     /// True where something is kept of a room's slot.
     pub fn has_kept(&self, name: &RoomName, slot: &str) -> bool {
         self.find(name).is_some_and(|room| lock(&room.state).neutrals.contains_key(slot))
@@ -88,14 +94,15 @@ impl Rooms {
 
     /// This node is a room's home from now on, under `epoch`, which others know of where it `is_shared`; they may have had
     /// `sessions` sessions of it.
-    pub fn lead(&self, name: &RoomName, epoch: u64, is_shared: bool, sessions: u32) {
-        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
+    pub fn lead(&self, name: &RoomName, epoch: u64, is_shared: bool, sessions: u32) -> Result<(), RoomError> {
+        let room = self.find_or_make(&mut lock(&self.by_name), name)?;
         let mut state = lock(&room.state);
         if !std::mem::replace(&mut state.is_home, true) {
             state.num_states_before = state.num_states;
         }
         (state.epoch, state.is_shared) = (epoch, is_shared);
         state.num_sessions = state.num_sessions.max(sessions);
+        Ok(())
     }
 
     /// Another node is a room's home under `epoch`: what was shown under a greater one came from a node that was none.

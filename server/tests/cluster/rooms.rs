@@ -84,6 +84,25 @@ pub fn room_has_one_publisher_in_the_whole_cluster() {
     a.publisher("demo", HELLO).ready();
 }
 
+pub fn hello_that_leads_to_nothing() {
+    let nats = Nats::start();
+    let a = Node::start(&nats.url()).ready();
+    let full = Node::with(&nats.url(), &["--max-rooms", "1"]).ready();
+    let mut first = a.publisher("demo", HELLO).ready();
+    let more = |fields: &str| HELLO.replace('}', &format!(r#","takeover":true,{fields}}}"#));
+    let refused = full.publisher("demo", &more(r#""profile":"nope""#)).answer();
+    assert_eq!(refused["code"], "unknown_profile", "{refused}");
+    let refused = full.publisher("demo", &more(r#""layout":"ibug68","image":[1,1],"focal":1e9"#)).answer();
+    assert_eq!(refused["type"], "error", "{refused}");
+    let _other = full.publisher("other", HELLO).ready();
+    let refused = full.publisher("demo", &more(r#""slot":"main""#)).answer();
+    assert_eq!(refused["code"], "too_many_rooms", "{refused}");
+    let mut viewer = a.viewer("demo");
+    first.frame(0.3);
+    viewer.packet();
+    assert_eq!(a.room("demo").unwrap()["publisher"]["source"], "test");
+}
+
 pub fn tracker_over_udp() {
     let nats = Nats::start();
     let (feed, port) = (write_feed(nats.folder.path(), 20), free_port());
