@@ -23,7 +23,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
-use tokio::sync::{Notify, mpsc, watch};
+use tokio::sync::{Notify, RwLock, mpsc, watch};
 use tokio_tungstenite::tungstenite::Bytes;
 
 use lease::Entering;
@@ -188,6 +188,8 @@ pub(crate) struct Cluster {
     is_cut: AtomicBool,
     /// The service ends: no room gets its home here.
     is_leaving: AtomicBool,
+    /// Read while a room is claimed.
+    claiming: RwLock<()>,
     /// Rooms of which this node's viewers want to see something, as they come and go.
     interest: watch::Sender<()>,
     /// Rooms whose home has changed.
@@ -271,6 +273,7 @@ impl Cluster {
             unheard: AtomicU32::new(0),
             is_cut: false.into(),
             is_leaving: false.into(),
+            claiming: RwLock::new(()),
             interest: watch::Sender::new(()),
             homes: watch::Sender::new(()),
             nodes: Mutex::default(),

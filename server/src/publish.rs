@@ -53,15 +53,12 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName, pass: &Pass) -
             Err(_) => return Err(refusal("hello_timeout", format!("no hello within {} seconds", timeouts.hello))),
         },
     };
-    let kept = match &hub.cluster {
-        Some(cluster) => cluster.find_kept(&hub.rooms, room, &hello).await,
-        None => hub.rooms.kept(room, &hello),
+    let prepared = tokio::select! {
+        biased;
+        () = stopped(&mut shutdown) => return Err(Ending::shutdown().into()),
+        () = until(pass.expires) => return Err(Ending::token_expired().into()),
+        prepared = enter(hub, room, hello) => prepared?,
     };
-    // Before anybody at another node loses the room to it.
-    let prepared = Prepared::new(hub, hello, kept.clone()).map_err(not_opened)?;
-    if let Some(cluster) = &hub.cluster {
-        cluster.enter(&hub.rooms, room, &prepared.hello, kept).await.map_err(not_entered)?;
-    }
     let (source, evicted) = Source::open(hub, room, prepared, Some(text)).map_err(|error| not_opened(error.into()))?;
     let heard = Heard::now();
     let mut session = Session::new(hub, pass, source, reader);
@@ -75,6 +72,19 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName, pass: &Pass) -
             refusal("idle", format!("nothing heard for {} seconds", timeouts.publisher_idle))
         }
     })
+}
+
+/// Makes this node the room's home, where there are others.
+async fn enter(hub: &Hub, room: &RoomName, hello: PublishHello) -> Result<Prepared, Stop> {
+    let Some(cluster) = &hub.cluster else {
+        let kept = hub.rooms.kept(room, &hello);
+        return Prepared::new(hub, hello, kept).map_err(not_opened);
+    };
+    let kept = cluster.find_kept(&hub.rooms, room, &hello).await;
+    // Before anybody at another node loses the room to it.
+    let prepared = Prepared::new(hub, hello, kept.clone()).map_err(not_opened)?;
+    cluster.enter(&hub.rooms, room, &prepared.hello, kept).await.map_err(not_entered)?;
+    Ok(prepared)
 }
 
 /// Reads up to the hello.

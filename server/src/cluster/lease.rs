@@ -120,7 +120,21 @@ impl Cluster {
 
     /// Makes this node the home of `room` for the publisher of `hello`, with what is `kept` of its slot; or says whose it is.
     /// Without NATS this node is it at once, until others can be asked.
-    pub async fn enter(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello, kept: Option<Kept>) -> Result<(), LeaseError> {
+    pub async fn enter(
+        self: &Arc<Self>,
+        rooms: &Arc<Rooms>,
+        room: &RoomName,
+        hello: &PublishHello,
+        kept: Option<Kept>,
+    ) -> Result<(), LeaseError> {
+        let (cluster, rooms, room, hello) = (self.clone(), rooms.clone(), room.clone(), hello.clone());
+        // In a task of its own: who waits may go, and no lease shall be left without this node's knowing of it.
+        let entering = tokio::spawn(async move { cluster.enter_now(&rooms, &room, &hello, kept).await });
+        entering.await.unwrap_or(Err(LeaseError::Leaving))
+    }
+
+    async fn enter_now(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello, kept: Option<Kept>) -> Result<(), LeaseError> {
+        let _claiming = self.claiming.read().await;
         if self.is_leaving.load(Ordering::SeqCst) {
             return Err(LeaseError::Leaving);
         }
@@ -164,7 +178,7 @@ impl Cluster {
         let (cluster, rooms, room, hello) = (self.clone(), rooms.clone(), room.clone(), hello.clone());
         tokio::spawn(async move {
             let kept = cluster.find_kept(&rooms, &room, &hello).await;
-            let entered = cluster.enter(&rooms, &room, &hello, kept).await;
+            let entered = cluster.enter_now(&rooms, &room, &hello, kept).await;
             let mut entering = lock(&cluster.entering);
             match entered {
                 Ok(()) => drop(entering.remove(&room)),
@@ -233,6 +247,7 @@ impl Cluster {
         let start = Instant::now();
         loop {
             match self.ask_home(lease, question).await {
+                _ if self.is_leaving.load(Ordering::SeqCst) => return Err(LeaseError::Leaving),
                 (Said::Yes, _) => return Ok(()),
                 (Said::No(answer), _) if answer.slots.iter().any(|taken| taken == slot) => return Err(LeaseError::Taken),
                 (Said::No(_), _) => return Err(LeaseError::Elsewhere { address: lease.address.clone() }),
@@ -277,9 +292,14 @@ impl Cluster {
     }
 
     fn hold(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: Option<u64>, sessions: u32) -> Result<(), LeaseError> {
+        let mut held = lock(&self.held);
+        // Behind the lock: all that is held is given back.
+        if self.is_leaving.load(Ordering::SeqCst) {
+            return Err(LeaseError::Leaving);
+        }
         rooms.lead(room, lease.epoch, revision.is_some(), sessions)?;
         tracing::info!(%room, epoch = lease.epoch, shared = revision.is_some(), "home of a room");
-        lock(&self.held).insert(room.clone(), Held { lease, revision, renewed: Instant::now(), empty_since: None });
+        held.insert(room.clone(), Held { lease, revision, renewed: Instant::now(), empty_since: None });
         Ok(())
     }
 
@@ -434,8 +454,13 @@ impl Cluster {
         let all: Vec<_> = lock(&self.held).drain().collect();
         let giving = all.iter().map(|(room, held)| self.give_back(rooms, room, &held.lease, held.revision));
         let giving = futures_util::stream::iter(giving).buffer_unordered(64).collect::<()>();
+        let all = async {
+            giving.await;
+            // What is being claimed in this moment is given back there.
+            drop(self.claiming.write().await);
+        };
         // Whoever comes for the rest finds that nobody answers.
-        let _ = tokio::time::timeout(Duration::from_secs(1), giving).await;
+        let _ = tokio::time::timeout(Duration::from_secs(1), all).await;
     }
 }
 

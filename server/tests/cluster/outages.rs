@@ -204,6 +204,21 @@ pub fn late_node() {
     assert!(!a.log().contains("another node is the room's home now"));
 }
 
+/// A node ends while it asks for a room whose home does not answer.
+pub fn leaves_while_it_asks() {
+    let mut cluster = Cluster::start();
+    let _first = cluster.nodes[0].publisher("demo", HELLO).ready();
+    signal(&cluster.nodes[0].process, Signal::STOP);
+    let mut waiting = cluster.nodes[1].publisher("demo", HELLO);
+    // It asks for two seconds.
+    std::thread::sleep(Duration::from_millis(500));
+    signal(&cluster.nodes[1].process, Signal::TERM);
+    assert_eq!(waiting.last_answer(), Value::Null, "it is not let in any more");
+    assert!(cluster.nodes[1].process.wait().unwrap().success());
+    assert!(!cluster.nodes[1].log().contains("home of a room"), "it takes no room that it cannot have");
+    signal(&cluster.nodes[0].process, Signal::CONT);
+}
+
 /// A lease vanishes from NATS while its home lives.
 pub fn lost_lease() {
     let cluster = Cluster::start();
