@@ -28,6 +28,7 @@ use tokio_tungstenite::tungstenite::Bytes;
 
 use lease::Entering;
 pub(crate) use lease::LeaseError;
+use lease::Leases;
 use wire::{EnterAnswer, EnterQuestion, LISTED_AT_ONCE, Lease, MOST_LISTED, NodeListing};
 pub(crate) use wire::{Kept, StateHead};
 
@@ -62,6 +63,10 @@ const KEPT_FOR: Duration = Duration::from_secs(24 * 3600);
 const MOST_LEASE_BYTES: i32 = 4096;
 /// Largest record kept of a performer.
 const MOST_KEPT_BYTES: i32 = 256 << 10;
+/// All leases: those of some 50,000 rooms. Beyond that the oldest goes, which is one that no home renews.
+const ALL_LEASE_BYTES: i64 = 16 << 20;
+/// All records of performers: of a thousand large ones, or tens of thousands as they are. Beyond that the oldest goes.
+const ALL_KEPT_BYTES: i64 = 256 << 20;
 
 /// Which cluster a node joins, and how it gets in.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Deserialize, clap::Args)]
@@ -195,7 +200,7 @@ pub(crate) struct Cluster {
     /// Rooms whose home has changed.
     homes: watch::Sender<()>,
     nodes: Mutex<HashMap<String, Told>>,
-    leases: Mutex<HashMap<RoomName, Lease>>,
+    leases: Mutex<Leases>,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -494,6 +499,7 @@ impl Cluster {
                 }
                 continue;
             }
+            lock(&self.leases).forget(Instant::now());
             if !self.is_cut.load(Ordering::SeqCst) {
                 self.renew(&rooms).await;
             }
@@ -521,7 +527,7 @@ impl Cluster {
     /// bucket: for that `async-nats` asks for more of the account than a server of version 2.9 says.
     async fn make_buckets(&self) -> Result<Buckets, String> {
         let jetstream = async_nats::jetstream::new(self.client.clone());
-        let make = async |name: &str, max_message_size: i32| {
+        let make = async |name: &str, max_message_size: i32, max_bytes: i64| {
             let bucket = format!("{}_{name}", self.prefix.replace('.', "_"));
             let config = stream::Config {
                 name: format!("KV_{bucket}"),
@@ -529,8 +535,9 @@ impl Cluster {
                 max_messages_per_subject: 1,
                 max_age: KEPT_FOR,
                 max_message_size,
+                max_bytes,
                 num_replicas: self.replicas,
-                discard: stream::DiscardPolicy::New,
+                discard: stream::DiscardPolicy::Old,
                 allow_rollup: true,
                 deny_delete: true,
                 allow_direct: true,
@@ -539,7 +546,10 @@ impl Cluster {
             jetstream.get_or_create_stream(config).await.map_err(|error| error.to_string())?;
             jetstream.get_key_value(bucket).await.map_err(|error| error.to_string())
         };
-        Ok(Buckets { leases: make("leases", MOST_LEASE_BYTES).await?, kept: make("kept", MOST_KEPT_BYTES).await? })
+        Ok(Buckets {
+            leases: make("leases", MOST_LEASE_BYTES, ALL_LEASE_BYTES).await?,
+            kept: make("kept", MOST_KEPT_BYTES, ALL_KEPT_BYTES).await?,
+        })
     }
 
     /// What the cluster keeps of a room's slot.

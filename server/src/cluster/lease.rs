@@ -1,12 +1,13 @@
 //! Leases: which node is a room's home.
 
 use super::wire::{EnterAnswer, EnterQuestion, Kept, Lease};
-use super::{Cluster, GATHERING, Held, REQUEST_TIMEOUT, lock};
+use super::{Cluster, GATHERING, Held, KEPT_FOR, REQUEST_TIMEOUT, lock};
 use crate::room::{RoomError, Rooms};
 use async_nats::RequestErrorKind;
 use async_nats::jetstream::kv::{CreateErrorKind, Operation, UpdateErrorKind};
 use futures_util::StreamExt;
 use rhytid_shared::{PublishHello, RoomName};
+use std::collections::HashMap;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -22,6 +23,8 @@ const SESSIONS_AT_ONCE: u32 = 1000;
 const SESSIONS_LEFT: u32 = 200;
 /// A lease is written again after this long: NATS forgets what is older than a day.
 const RENEWED_AFTER: Duration = Duration::from_secs(3600);
+/// Between looks for leases that are to be forgotten.
+const LOOKED_THROUGH_AFTER: Duration = Duration::from_secs(60);
 /// How long a home that does not answer may just be slow: only one who wants back what it had does not wait.
 const SLOW: Duration = Duration::from_secs(2);
 /// Between questions to a home that does not answer.
@@ -63,6 +66,40 @@ impl LeaseError {
             Self::Cluster(_) => "cluster",
             Self::Room(error) => error.code(),
             Self::Leaving => "shutting_down",
+        }
+    }
+}
+
+/// The leases of all rooms as NATS has told of them.
+#[derive(Default)]
+pub(super) struct Leases {
+    by_room: HashMap<RoomName, (Lease, Instant)>,
+    /// When they were looked through.
+    looked: Option<Instant>,
+}
+
+impl Leases {
+    fn get(&self, room: &RoomName) -> Option<&Lease> {
+        self.by_room.get(room).map(|(lease, _)| lease)
+    }
+
+    fn remove(&mut self, room: &RoomName) {
+        self.by_room.remove(room);
+    }
+
+    /// Takes what NATS has told at `now`; true where the room's home or its epoch is another than before.
+    fn insert(&mut self, room: RoomName, lease: Lease, now: Instant) -> bool {
+        let home = (lease.node.clone(), lease.epoch);
+        let before = self.by_room.insert(room, (lease, now));
+        before.is_none_or(|(before, _)| (before.node, before.epoch) != home)
+    }
+
+    /// Forgets what NATS has forgotten by `now`, which tells nobody of that: leases that no home renews.
+    pub fn forget(&mut self, now: Instant) {
+        if self.looked.is_none_or(|looked| now.saturating_duration_since(looked) >= LOOKED_THROUGH_AFTER) {
+            self.looked = Some(now);
+            self.by_room.retain(|_, (_, told)| now.saturating_duration_since(*told) < KEPT_FOR);
+            self.by_room.shrink_to_fit();
         }
     }
 }
@@ -432,7 +469,7 @@ impl Cluster {
             } else if lease.node != self.node {
                 rooms.follow(&room, lease.epoch);
             }
-            lock(&self.leases).insert(room, lease);
+            lock(&self.leases).insert(room, lease, Instant::now());
             self.homes.send_replace(());
             self.interest.send_replace(());
         }
@@ -470,7 +507,6 @@ fn text_of(lease: &Lease) -> Bytes {
 
 #[cfg(test)]
 mod tests {
-    use super::super::KEPT_FOR;
     use super::*;
 
     #[test]
@@ -485,5 +521,18 @@ mod tests {
         assert!(Held { revision: None, ..held.clone() }.is_due(0, now));
         let empty = Held { empty_since: Some(now), ..held };
         assert!(!empty.is_due(0, now + EMPTY_FOR / 2) && empty.is_due(0, now + EMPTY_FOR));
+    }
+
+    #[test]
+    fn lease_that_no_home_renews_is_forgotten() {
+        let (start, mut leases) = (Instant::now(), Leases::default());
+        let [old, renewed] = ["old", "renewed"].map(|name| RoomName::new(name).unwrap());
+        let lease = Lease { node: "a".into(), epoch: 1, ..Lease::default() };
+        assert!(leases.insert(old.clone(), lease.clone(), start) && leases.insert(renewed.clone(), lease.clone(), start));
+        leases.forget(start + KEPT_FOR / 2);
+        assert!(leases.get(&old).is_some());
+        assert!(!leases.insert(renewed.clone(), Lease { sessions: 1000, ..lease }, start + KEPT_FOR / 2), "it says nothing new");
+        leases.forget(start + KEPT_FOR);
+        assert_eq!((leases.get(&old), leases.by_room.len()), (None, 1));
     }
 }
