@@ -46,6 +46,10 @@ const BUCKET_TIMEOUT: Duration = Duration::from_secs(3);
 const FIRST_JOIN: Duration = Duration::from_secs(2);
 /// How long the others may take to find NATS again when it is back: until then who does not answer may live.
 const GATHERING: Duration = Duration::from_secs(3);
+/// Records that wait to be kept: one for each slot of a thousand rooms.
+const MOST_KEEPING: usize = 8192;
+/// Records that are sent to be kept at a time.
+const KEEPING_AT_ONCE: usize = 16;
 /// How often a node tells of itself and looks after its leases.
 const ROUND: Duration = Duration::from_millis(500);
 /// A node that has told something so often and has not heard itself is cut off, whatever TCP thinks: NATS's own pings wait for as
@@ -154,6 +158,41 @@ struct Held {
     empty_since: Option<Instant>,
 }
 
+/// What is to be kept in NATS: of each key the newest value only, so that none overtakes another.
+#[derive(Default)]
+struct Keeping {
+    waiting: Mutex<HashMap<String, Bytes>>,
+    is_there: Notify,
+}
+
+impl Keeping {
+    /// False where there is no place for one more key.
+    fn put(&self, key: String, value: Bytes) -> bool {
+        let mut waiting = lock(&self.waiting);
+        if waiting.len() >= MOST_KEEPING && !waiting.contains_key(&key) {
+            return false;
+        }
+        waiting.insert(key, value);
+        self.is_there.notify_one();
+        true
+    }
+
+    fn take_now(&self) -> HashMap<String, Bytes> {
+        std::mem::take(&mut *lock(&self.waiting))
+    }
+
+    /// Waits for values to keep.
+    async fn take(&self) -> HashMap<String, Bytes> {
+        loop {
+            let taken = self.take_now();
+            if !taken.is_empty() {
+                return taken;
+            }
+            self.is_there.notified().await;
+        }
+    }
+}
+
 /// Connections to NATS.
 struct Connections {
     /// Made so far.
@@ -201,6 +240,7 @@ pub(crate) struct Cluster {
     homes: watch::Sender<()>,
     nodes: Mutex<HashMap<String, Told>>,
     leases: Mutex<Leases>,
+    keeping: Keeping,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -283,6 +323,7 @@ impl Cluster {
             homes: watch::Sender::new(()),
             nodes: Mutex::default(),
             leases: Mutex::default(),
+            keeping: Keeping::default(),
         }))
     }
 
@@ -360,6 +401,8 @@ impl Cluster {
         tasks.spawn(self.clone().hear_of_nodes());
         tasks.spawn(self.clone().look_after(rooms.clone()));
         tasks.spawn(feed::run(self.clone(), rooms));
+        // Not cut off in the middle of what it has taken.
+        tokio::spawn(self.clone().keep_all(shutdown.clone()));
         let mut shutdown = shutdown.clone();
         tokio::spawn(async move {
             stopped(&mut shutdown).await;
@@ -560,16 +603,42 @@ impl Cluster {
     }
 
     /// Keeps what a room keeps of a slot, for whichever node its publisher comes to next.
-    pub fn keep(self: &Arc<Self>, room: &RoomName, slot: &str, kept: &Kept) {
-        let Some(buckets) = self.buckets.get().cloned() else { return };
-        let (key, text) = (format!("{room}.{slot}"), serde_json::to_vec(kept).expect("plain data can be written"));
-        tokio::spawn(async move {
-            match tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.put(&key, text.into())).await {
-                Ok(Ok(_)) => {}
-                Ok(Err(error)) => tracing::warn!(key, %error, "neutral face not kept in the cluster"),
-                Err(_) => tracing::warn!(key, "neutral face not kept in the cluster: no answer"),
-            }
-        });
+    pub fn keep(&self, room: &RoomName, slot: &str, kept: &Kept) {
+        let text = serde_json::to_vec(kept).expect("plain data can be written");
+        if !self.keeping.put(format!("{room}.{slot}"), text.into()) {
+            tracing::warn!(%room, slot, "neutral face not kept in the cluster: too many wait");
+        }
+    }
+
+    /// Keeps what there is to keep until the service ends.
+    async fn keep_all(self: Arc<Self>, mut shutdown: watch::Receiver<bool>) {
+        loop {
+            let taken = tokio::select! {
+                taken = self.keeping.take() => taken,
+                () = stopped(&mut shutdown) => return,
+            };
+            self.keep_these(taken).await;
+        }
+    }
+
+    /// Keeps what publishers have left in the last moment.
+    pub async fn keep_rest(&self) {
+        // Without NATS each would wait for its own time.
+        let _ = tokio::time::timeout(Duration::from_secs(1), self.keep_these(self.keeping.take_now())).await;
+    }
+
+    /// Done with all of them, so that the next value of any key comes behind them.
+    async fn keep_these(&self, taken: HashMap<String, Bytes>) {
+        if let Some(buckets) = self.buckets.get() {
+            let puts = taken.into_iter().map(async |(key, text)| {
+                match tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.put(&key, text)).await {
+                    Ok(Ok(_)) => {}
+                    Ok(Err(error)) => tracing::warn!(key, %error, "neutral face not kept in the cluster"),
+                    Err(_) => tracing::warn!(key, "neutral face not kept in the cluster: no answer"),
+                }
+            });
+            futures_util::stream::iter(puts).buffer_unordered(KEEPING_AT_ONCE).collect::<()>().await;
+        }
     }
 }
 
@@ -613,6 +682,17 @@ fn without_password(url: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn newest_of_each_key_is_kept() {
+        let keeping = Keeping::default();
+        for (key, value) in [("a", "1"), ("b", "2"), ("a", "3")] {
+            assert!(keeping.put(key.into(), value.into()));
+        }
+        assert_eq!(keeping.take().await, HashMap::from([("a".into(), "3".into()), ("b".into(), "2".into())]));
+        assert!((0..MOST_KEEPING).all(|k| keeping.put(k.to_string(), Bytes::new())));
+        assert!(!keeping.put("one more".into(), Bytes::new()) && keeping.put("7".into(), "new".into()));
+    }
 
     #[test]
     fn passwords_are_not_shown() {

@@ -289,6 +289,9 @@ pub async fn run(
     if tokio::time::timeout(SHUTDOWN_TIMEOUT, tasks_end.recv()).await.is_err() {
         tracing::warn!("some sockets did not close in time");
     }
+    if let Some(cluster) = &cluster {
+        cluster.keep_rest().await;
+    }
     Ok(())
 }
 
