@@ -501,6 +501,7 @@ impl Cluster {
             }
             let Some(rooms) = rooms.upgrade() else { return };
             if self.client.connection_state() != State::Connected {
+                self.give_up_empty(&rooms);
                 continue;
             }
             let connection = self.connection();
@@ -540,6 +541,7 @@ impl Cluster {
                 if let Err(error) = self.client.force_reconnect().await {
                     tracing::debug!(%error, "cannot connect anew");
                 }
+                self.give_up_empty(&rooms);
                 continue;
             }
             lock(&self.leases).forget(Instant::now());

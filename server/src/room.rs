@@ -330,12 +330,14 @@ impl Rooms {
         state.neutrals.get(&hello.slot.name).filter(|neutral| neutral.kept.tracker == hello.tracker()).map(|neutral| neutral.kept.clone())
     }
 
-    /// Removes rooms that have been without publisher and viewers for `idle`.
+    /// Removes rooms that have been without publisher and viewers for `idle`; among nodes, none whose home is here: its lease
+    /// is given back before.
     pub fn sweep(&self, idle: Duration) {
         let mut by_name = lock(&self.by_name);
         by_name.retain(|_, room| {
             let state = lock(&room.state);
-            !state.publishers.is_empty() || state.num_viewers > 0 || state.empty_since.elapsed() < idle
+            let is_led = self.others.is_some() && state.is_home;
+            is_led || !state.publishers.is_empty() || state.num_viewers > 0 || state.empty_since.elapsed() < idle
         });
         self.metrics.rooms.set(by_name.len() as i64);
     }

@@ -168,6 +168,17 @@ mod tests {
     }
 
     #[test]
+    fn room_is_not_swept_before_its_lease_is_given_back() {
+        let (rooms, ..) = node();
+        rooms.lead(&name(), 7, true, 5).unwrap();
+        rooms.sweep(Duration::ZERO);
+        assert_eq!(rooms.num_sessions(&name()), 5);
+        assert!(rooms.give_up(&name()));
+        rooms.sweep(Duration::ZERO);
+        assert!(rooms.find(&name()).is_none());
+    }
+
+    #[test]
     fn node_that_was_no_home_does_not_shut_out_the_one_that_is() {
         let (home, mut outbound, layout) = node();
         home.lead(&name(), 9, true, 0).unwrap();

@@ -132,6 +132,12 @@ async fn within<T>(answer: impl Future<Output = T>) -> Option<T> {
 }
 
 impl Held {
+    /// Notes at `now` whether its room has a publisher; true where it has had none for long enough.
+    fn note_empty(&mut self, is_empty: bool, now: Instant) -> bool {
+        self.empty_since = is_empty.then(|| self.empty_since.unwrap_or(now));
+        self.is_empty(now)
+    }
+
     /// Its room has had no publisher for long enough.
     fn is_empty(&self, now: Instant) -> bool {
         self.empty_since.is_some_and(|since| now.saturating_duration_since(since) >= EMPTY_FOR)
@@ -346,8 +352,7 @@ impl Cluster {
         {
             let mut held = lock(&self.held);
             for (room, held) in held.iter_mut() {
-                let is_empty = rooms.slots(room).is_empty();
-                held.empty_since = if is_empty { Some(held.empty_since.unwrap_or_else(Instant::now)) } else { None };
+                held.note_empty(rooms.slots(room).is_empty(), Instant::now());
                 if held.is_due(rooms.num_sessions(room), Instant::now()) {
                     due.push((room.clone(), held.clone()));
                 }
@@ -358,11 +363,32 @@ impl Cluster {
         futures_util::stream::iter(due).buffer_unordered(64).collect::<()>().await;
     }
 
+    /// Lets go of a room, unless a publisher has entered it, or is about to.
+    fn give_up(&self, rooms: &Rooms, room: &RoomName) -> Option<Held> {
+        let mut held = lock(&self.held);
+        let is_given_up = held.get(room).is_some_and(|held| held.is_empty(Instant::now())) && rooms.give_up(room);
+        if is_given_up { held.remove(room) } else { None }
+    }
+
+    /// Lets go of rooms without a publisher while NATS is away: what it has recorded of them binds nobody.
+    pub(super) fn give_up_empty(&self, rooms: &Rooms) {
+        for room in self.look_for_empty(rooms) {
+            self.give_up(rooms, &room);
+        }
+    }
+
+    /// Notes which rooms have no publisher; gives those that have been so for long enough.
+    fn look_for_empty(&self, rooms: &Rooms) -> Vec<RoomName> {
+        let mut held = lock(&self.held);
+        held.iter_mut()
+            .filter_map(|(room, held)| held.note_empty(rooms.slots(room).is_empty(), Instant::now()).then(|| room.clone()))
+            .collect()
+    }
+
     async fn renew_one(&self, rooms: &Rooms, room: &RoomName, held: Held) {
         let Some(buckets) = self.buckets.get() else { return };
         if held.is_empty(Instant::now()) {
-            if rooms.give_up(room) {
-                lock(&self.held).remove(room);
+            if let Some(held) = self.give_up(rooms, room) {
                 self.give_back(rooms, room, &held.lease, held.revision).await;
             }
             return;
