@@ -208,9 +208,10 @@ impl Rooms {
             return Err(RoomError::TooManyViewers { most: self.max_viewers });
         }
         state.num_viewers += 1;
+        let is_first = state.num_viewers == 1;
         drop(state);
         self.metrics.viewers.inc();
-        if let Some(interest) = &room.interest {
+        if let Some(interest) = room.interest.as_ref().filter(|_| is_first) {
             interest.send_replace(());
         }
         Ok(Viewing { slot: room.slot.subscribe(), room })
@@ -390,8 +391,10 @@ impl Drop for Viewing {
         let mut state = lock(&self.room.state);
         state.num_viewers -= 1;
         state.empty_since = Instant::now();
+        let is_last = state.num_viewers == 0;
+        drop(state);
         self.room.metrics.viewers.dec();
-        if let Some(interest) = &self.room.interest {
+        if let Some(interest) = self.room.interest.as_ref().filter(|_| is_last) {
             interest.send_replace(());
         }
     }

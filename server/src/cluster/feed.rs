@@ -26,15 +26,15 @@ pub(super) async fn run(cluster: Arc<Cluster>, rooms: Weak<Rooms>) {
         let Some(rooms) = rooms.upgrade() else { return };
         let watched = rooms.watched();
         feeds.retain(|room, feed| {
-            let is_wanted = watched.iter().any(|known| known.name == *room) && !cluster.is_home(room) && !feed.is_finished();
+            let is_wanted = watched.contains_key(room) && !cluster.is_home(room) && !feed.is_finished();
             if !is_wanted {
                 feed.abort();
             }
             is_wanted
         });
-        for room in watched {
-            if !cluster.is_home(&room.name) && !feeds.contains_key(&room.name) {
-                feeds.insert(room.name.clone(), tokio::spawn(feed(cluster.clone(), room)));
+        for (name, room) in watched {
+            if !feeds.contains_key(&name) && !cluster.is_home(&name) {
+                feeds.insert(name, tokio::spawn(feed(cluster.clone(), room)));
             }
         }
     }
@@ -107,9 +107,13 @@ mod tests {
 
     /// A node's rooms, and what leaves them for other nodes.
     fn node() -> (Arc<Rooms>, mpsc::Receiver<Outbound>, PacketLayout) {
+        node_that_tells(watch::Sender::new(()))
+    }
+
+    fn node_that_tells(interest: watch::Sender<()>) -> (Arc<Rooms>, mpsc::Receiver<Outbound>, PacketLayout) {
         let character = Arc::new(Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap());
         let (outlet, outbound) = mpsc::channel(64);
-        let others = Others { outlet: Outlet(outlet), interest: watch::Sender::new(()) };
+        let others = Others { outlet: Outlet(outlet), interest };
         let layout = PacketLayout::from(&*character);
         let metrics = Arc::new(Metrics::new());
         let recorder = Recorder::new(RecordConfig::default(), &character, metrics.clone(), mpsc::channel(1).0);
@@ -165,6 +169,27 @@ mod tests {
         home.lead(&name(), 8, true, 0).unwrap();
         assert!(place.publish(&FaceFrame { session: place.session, seq: 2, ..layout.frame_at_rest() }, None));
         assert_eq!(sent(&mut outbound)[0].0.epoch, 8);
+    }
+
+    #[test]
+    fn interest_changes_with_the_first_viewer_and_the_last() {
+        let told = watch::Sender::new(());
+        let mut interest = told.subscribe();
+        let (rooms, ..) = node_that_tells(told);
+        let mut has_changed = || {
+            let has_changed = interest.has_changed().unwrap();
+            interest.mark_unchanged();
+            has_changed
+        };
+        let first = rooms.join(&name()).unwrap();
+        assert!(has_changed());
+        let second = rooms.join(&name()).unwrap();
+        drop(first);
+        assert!(!has_changed());
+        assert_eq!(rooms.watched().len(), 1);
+        drop(second);
+        assert!(has_changed());
+        assert!(rooms.watched().is_empty());
     }
 
     #[test]

@@ -495,9 +495,11 @@ impl Cluster {
             } else if lease.node != self.node {
                 rooms.follow(&room, lease.epoch);
             }
-            lock(&self.leases).insert(room, lease, Instant::now());
-            self.homes.send_replace(());
-            self.interest.send_replace(());
+            // Every home writes its leases again now and then.
+            if lock(&self.leases).insert(room, lease, Instant::now()) {
+                self.homes.send_replace(());
+                self.interest.send_replace(());
+            }
         }
     }
 

@@ -4,6 +4,7 @@ use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomError, RoomState, R
 use crate::cluster::{Kept, Outlet, StateHead};
 use rhytid_shared::packet::{Decoder, PacketKind};
 use rhytid_shared::{FaceFrame, RoomName};
+use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 use tokio::sync::watch;
@@ -13,7 +14,7 @@ use tokio_tungstenite::tungstenite::Bytes;
 pub(crate) struct Others {
     /// Where packets leave for them.
     pub outlet: Outlet,
-    /// Told when a room's viewers come or go.
+    /// Told when a room's first viewer comes, or its last one goes.
     pub interest: watch::Sender<()>,
 }
 
@@ -144,8 +145,10 @@ impl Rooms {
     }
 
     /// Rooms that somebody watches here.
-    pub fn watched(&self) -> Vec<Arc<Room>> {
-        lock(&self.by_name).values().filter(|room| lock(&room.state).num_viewers > 0).cloned().collect()
+    pub fn watched(&self) -> HashMap<RoomName, Arc<Room>> {
+        let by_name = lock(&self.by_name);
+        let watched = by_name.iter().filter(|(_, room)| lock(&room.state).num_viewers > 0);
+        watched.map(|(name, room)| (name.clone(), room.clone())).collect()
     }
 }
 
