@@ -95,7 +95,8 @@ pub struct ClusterConfig {
     /// Servers of a NATS cluster that keep each record, 1 to 5; 1 where it is not said.
     #[arg(long = "cluster-replicas", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=5))]
     pub replicas: Option<u8>,
-    /// Where other nodes send publishers of a room whose home this node is; default: the address it listens on.
+    /// Where other nodes send publishers of a room whose home this node is; default: the address it listens on, which will not do
+    /// where that is all addresses (0.0.0.0).
     #[arg(long = "cluster-advertise", value_name = "URL")]
     pub advertise: Option<String>,
 }

@@ -2,6 +2,7 @@
 
 use super::nats::Nats;
 use super::nodes::{HELLO, Node};
+use super::process::wait_for;
 use super::watch::Watch;
 use serde_json::{Value, json};
 use std::time::Duration;
@@ -34,6 +35,18 @@ pub fn password_and_certificates() {
         assert!(!outside.log().contains("s3cret"), "passwords are not logged");
     }
     watch.finish();
+}
+
+pub fn advertised_address() {
+    let nats = Nats::start();
+    let everywhere = ["--listen", "0.0.0.0:0", "--insecure"];
+    let warning = "--cluster-advertise";
+    let silent = Node::with(&nats.url(), &everywhere).ready();
+    assert!(silent.log().contains(warning), "{}", silent.log());
+    let named = "wss://face.example:7879";
+    let telling = Node::with(&nats.url(), &[&everywhere[..], &["--cluster-advertise", named]].concat()).ready();
+    assert!(!telling.log().contains(warning), "{}", telling.log());
+    wait_for("its address", || silent.rooms()["nodes"].as_object().unwrap().values().any(|address| address == named).then_some(()));
 }
 
 /// Text of a JSON Web Token as NATS signs it.
