@@ -64,6 +64,7 @@ mod linux {
             trial("tracker_over_udp_holds_its_room_before_all_nodes", rooms::tracker_over_udp),
             trial("password_and_certificates_of_nats_are_passed_through", admission::password_and_certificates),
             trial("node_at_all_addresses_is_to_say_which_one_others_tell", admission::advertised_address),
+            trial("certificate_of_a_node_is_shown_to_nats", admission::own_certificate),
             trial("credentials_of_an_account_are_passed_through", admission::credentials),
             trial("node_whose_link_is_cut_goes_on_alone_and_joins_again", outages::cut_link)
                 .with_ignored_flag(!has_nats || !namespace::Namespace::is_possible()),
