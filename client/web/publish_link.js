@@ -37,6 +37,8 @@ export class PublishLink {
     this.socket = null;
     this.timer = 0;
     this.wasReadyAt = -Infinity;
+    /** Number of the last session that was ready: who comes back takes its own slot back with it. */
+    this.session = 0;
     this.numFrames = 0;
     this.numSkipped = 0;
     this.bytes = 0;
@@ -73,7 +75,7 @@ export class PublishLink {
     socket.onopen = () => {
       wasOpen = true;
       const again = this.wasReadyAt > -Infinity;
-      const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true } : {}) };
+      const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true, resume: this.session } : {}) };
       socket.send(JSON.stringify(hello));
     };
     const tooLate = setTimeout(() => socket.close(), PATIENCE);
@@ -90,6 +92,7 @@ export class PublishLink {
       if (message.type === "ready") {
         this.backoff.reset();
         this.wasReadyAt = performance.now();
+        this.session = message.session;
         this.#become("ready", "");
       }
       this.questions.heard(message);

@@ -14,7 +14,7 @@ use crate::room::{Others, RoomListing, Rooms};
 use crate::service::stopped;
 use async_nats::connection::State;
 use async_nats::jetstream::{kv, stream};
-use async_nats::{Client, ConnectOptions, Event};
+use async_nats::{Client, ConnectOptions, Event, Subject};
 use futures_util::StreamExt;
 use rhytid_shared::RoomName;
 use serde::Deserialize;
@@ -23,10 +23,12 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
-use tokio::sync::{Notify, mpsc, watch};
+use tokio::sync::{Notify, RwLock, mpsc, watch};
 use tokio_tungstenite::tungstenite::Bytes;
 
 use lease::Entering;
+pub(crate) use lease::LeaseError;
+use lease::Leases;
 use wire::{EnterAnswer, EnterQuestion, LISTED_AT_ONCE, Lease, MOST_LISTED, NodeListing};
 pub(crate) use wire::{Kept, StateHead};
 
@@ -44,6 +46,10 @@ const BUCKET_TIMEOUT: Duration = Duration::from_secs(3);
 const FIRST_JOIN: Duration = Duration::from_secs(2);
 /// How long the others may take to find NATS again when it is back: until then who does not answer may live.
 const GATHERING: Duration = Duration::from_secs(3);
+/// Records that wait to be kept: one for each slot of a thousand rooms.
+const MOST_KEEPING: usize = 8192;
+/// Records that are sent to be kept at a time.
+const KEEPING_AT_ONCE: usize = 16;
 /// How often a node tells of itself and looks after its leases.
 const ROUND: Duration = Duration::from_millis(500);
 /// A node that has told something so often and has not heard itself is cut off, whatever TCP thinks: NATS's own pings wait for as
@@ -61,6 +67,10 @@ const KEPT_FOR: Duration = Duration::from_secs(24 * 3600);
 const MOST_LEASE_BYTES: i32 = 4096;
 /// Largest record kept of a performer.
 const MOST_KEPT_BYTES: i32 = 256 << 10;
+/// All leases: those of some 50,000 rooms. Beyond that the oldest goes, which is one that no home renews.
+const ALL_LEASE_BYTES: i64 = 16 << 20;
+/// All records of performers: of a thousand large ones, or tens of thousands as they are. Beyond that the oldest goes.
+const ALL_KEPT_BYTES: i64 = 256 << 20;
 
 /// Which cluster a node joins, and how it gets in.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Deserialize, clap::Args)]
@@ -85,7 +95,8 @@ pub struct ClusterConfig {
     /// Servers of a NATS cluster that keep each record, 1 to 5; 1 where it is not said.
     #[arg(long = "cluster-replicas", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=5))]
     pub replicas: Option<u8>,
-    /// Where other nodes send publishers of a room whose home this node is; default: the address it listens on.
+    /// Where other nodes send publishers of a room whose home this node is; default: the address it listens on, which will not do
+    /// where that is all addresses (0.0.0.0).
     #[arg(long = "cluster-advertise", value_name = "URL")]
     pub advertise: Option<String>,
 }
@@ -114,19 +125,39 @@ pub enum ClusterError {
 /// A packet on its way to other nodes.
 struct Outbound {
     since: Instant,
-    room: RoomName,
+    subject: Subject,
     message: Bytes,
 }
 
-/// Where a room's packets leave for other nodes.
+/// Where packets leave for other nodes.
 #[derive(Clone)]
-pub(crate) struct Outlet(mpsc::Sender<Outbound>);
+pub(crate) struct Outlet {
+    prefix: String,
+    outbound: mpsc::Sender<Outbound>,
+}
 
 impl Outlet {
-    /// Sends a packet without waiting; false where it found no place.
-    pub fn send(&self, room: &RoomName, head: StateHead, packet: &[u8]) -> bool {
-        self.0.try_send(Outbound { since: Instant::now(), room: room.clone(), message: head.message(packet) }).is_ok()
+    /// Where a room's packets leave.
+    pub fn of(&self, room: &RoomName) -> RoomOutlet {
+        RoomOutlet { subject: packets_of(&self.prefix, room), outbound: self.outbound.clone() }
     }
+}
+
+/// Where one room's packets leave for other nodes.
+pub(crate) struct RoomOutlet {
+    subject: Subject,
+    outbound: mpsc::Sender<Outbound>,
+}
+
+impl RoomOutlet {
+    /// Sends a [`StateHead::message`] without waiting; false where it found no place.
+    pub fn send(&self, message: Bytes) -> bool {
+        self.outbound.try_send(Outbound { since: Instant::now(), subject: self.subject.clone(), message }).is_ok()
+    }
+}
+
+fn packets_of(prefix: &str, room: &RoomName) -> Subject {
+    format!("{prefix}.room.{room}").into()
 }
 
 /// The buckets that nodes share.
@@ -142,8 +173,45 @@ struct Held {
     lease: Lease,
     /// Of its record; `None` where NATS was not to be had, or has come back, and it has yet to be claimed.
     revision: Option<u64>,
+    /// When its record was written.
+    renewed: Instant,
     /// Since when its room has had no publisher.
     empty_since: Option<Instant>,
+}
+
+/// What is to be kept in NATS: of each key the newest value only, so that none overtakes another.
+#[derive(Default)]
+struct Keeping {
+    waiting: Mutex<HashMap<String, Bytes>>,
+    is_there: Notify,
+}
+
+impl Keeping {
+    /// False where there is no place for one more key.
+    fn put(&self, key: String, value: Bytes) -> bool {
+        let mut waiting = lock(&self.waiting);
+        if waiting.len() >= MOST_KEEPING && !waiting.contains_key(&key) {
+            return false;
+        }
+        waiting.insert(key, value);
+        self.is_there.notify_one();
+        true
+    }
+
+    fn take_now(&self) -> HashMap<String, Bytes> {
+        std::mem::take(&mut *lock(&self.waiting))
+    }
+
+    /// Waits for values to keep.
+    async fn take(&self) -> HashMap<String, Bytes> {
+        loop {
+            let taken = self.take_now();
+            if !taken.is_empty() {
+                return taken;
+            }
+            self.is_there.notified().await;
+        }
+    }
 }
 
 /// Connections to NATS.
@@ -168,6 +236,7 @@ pub(crate) struct Cluster {
     connections: Arc<Connections>,
     /// Which connection the buckets and leases have been looked at through, and since when.
     joined: watch::Sender<(u64, Instant)>,
+    started: Instant,
     node: String,
     address: String,
     replicas: usize,
@@ -184,12 +253,15 @@ pub(crate) struct Cluster {
     is_cut: AtomicBool,
     /// The service ends: no room gets its home here.
     is_leaving: AtomicBool,
+    /// Read while a room is claimed.
+    claiming: RwLock<()>,
     /// Rooms of which this node's viewers want to see something, as they come and go.
     interest: watch::Sender<()>,
     /// Rooms whose home has changed.
     homes: watch::Sender<()>,
     nodes: Mutex<HashMap<String, Told>>,
-    leases: Mutex<HashMap<RoomName, Lease>>,
+    leases: Mutex<Leases>,
+    keeping: Keeping,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -250,26 +322,30 @@ impl Cluster {
             .await
             .map_err(|error| problem(error.to_string()))?;
         let (outlet, outbound) = mpsc::channel(MOST_WAITING);
+        let prefix = format!("rhytid.{}", &character_sha256[..8.min(character_sha256.len())]);
         Ok(Arc::new(Self {
             node: node_id(),
             address,
             replicas: usize::from(config.replicas.unwrap_or(1)),
-            prefix: format!("rhytid.{}", &character_sha256[..8.min(character_sha256.len())]),
             client,
             connections,
             joined: watch::Sender::new((0, Instant::now())),
+            started: Instant::now(),
             outbound: Mutex::new(Some(outbound)),
-            outlet: Outlet(outlet),
+            outlet: Outlet { prefix: prefix.clone(), outbound: outlet },
+            prefix,
             buckets: OnceLock::new(),
             held: Mutex::default(),
             entering: Mutex::default(),
             unheard: AtomicU32::new(0),
             is_cut: false.into(),
             is_leaving: false.into(),
+            claiming: RwLock::new(()),
             interest: watch::Sender::new(()),
             homes: watch::Sender::new(()),
             nodes: Mutex::default(),
             leases: Mutex::default(),
+            keeping: Keeping::default(),
         }))
     }
 
@@ -301,8 +377,9 @@ impl Cluster {
     /// The connection is so fresh that others may not be back yet.
     fn is_gathering(&self) -> bool {
         let (connection, since) = *self.joined.borrow();
-        // The first one is as old as this node, and no sign that the others have lost theirs.
-        connection > 1 && since.elapsed() < GATHERING
+        // The first one is as old as this node, and no sign that the others have lost theirs, unless NATS was away meanwhile.
+        let may_be_lost = connection > 1 || since.saturating_duration_since(self.started) > FIRST_JOIN;
+        may_be_lost && since.elapsed() < GATHERING
     }
 
     /// Waits until the node has joined, but not for long.
@@ -332,8 +409,8 @@ impl Cluster {
         format!("{}.{rest}", self.prefix)
     }
 
-    fn packets_of(&self, room: &RoomName) -> String {
-        self.subject(&format!("room.{room}"))
+    fn packets_of(&self, room: &RoomName) -> Subject {
+        packets_of(&self.prefix, room)
     }
 
     /// Runs the node's part until the service ends.
@@ -343,9 +420,11 @@ impl Cluster {
             tasks.spawn(self.clone().send_packets(outbound));
         }
         tasks.spawn(self.clone().answer(rooms.clone()));
-        tasks.spawn(self.clone().hear_of_nodes());
+        tasks.spawn(self.clone().hear_of_nodes(rooms.clone()));
         tasks.spawn(self.clone().look_after(rooms.clone()));
         tasks.spawn(feed::run(self.clone(), rooms));
+        // Not cut off in the middle of what it has taken.
+        tokio::spawn(self.clone().keep_all(shutdown.clone()));
         let mut shutdown = shutdown.clone();
         tokio::spawn(async move {
             stopped(&mut shutdown).await;
@@ -354,13 +433,13 @@ impl Cluster {
     }
 
     async fn send_packets(self: Arc<Self>, mut outbound: mpsc::Receiver<Outbound>) {
-        while let Some(Outbound { since, room, message }) = outbound.recv().await {
+        while let Some(Outbound { since, subject, message }) = outbound.recv().await {
             // Without a connection it would only wait: by then it is old.
             if since.elapsed() < OLD
                 && self.client.connection_state() == State::Connected
-                && let Err(error) = self.client.publish(self.packets_of(&room), message).await
+                && let Err(error) = self.client.publish(subject.clone(), message).await
             {
-                tracing::debug!(%room, %error, "packet not sent to other nodes");
+                tracing::debug!(%subject, %error, "packet not sent to other nodes");
             }
         }
     }
@@ -404,7 +483,7 @@ impl Cluster {
         EnterAnswer { is_granted, slots: slots.into_iter().map(|(slot, _)| slot).collect() }
     }
 
-    async fn hear_of_nodes(self: Arc<Self>) {
+    async fn hear_of_nodes(self: Arc<Self>, rooms: Weak<Rooms>) {
         let Ok(mut listings) = self.client.subscribe(self.subject("listing")).await else { return };
         while let Some(message) = listings.next().await {
             let told = match serde_json::from_slice::<NodeListing>(&message.payload) {
@@ -419,6 +498,8 @@ impl Cluster {
                 self.is_cut.store(false, Ordering::SeqCst);
                 continue;
             }
+            let Some(rooms) = rooms.upgrade() else { return };
+            rooms.want(told.is_partial, told.rooms.iter().filter(|room| room.is_wanted()).map(|room| room.name.as_str()));
             let mut nodes = lock(&self.nodes);
             if nodes.len() >= MOST_NODES && !nodes.contains_key(&told.node) {
                 continue;
@@ -444,6 +525,7 @@ impl Cluster {
             }
             let Some(rooms) = rooms.upgrade() else { return };
             if self.client.connection_state() != State::Connected {
+                self.give_up_empty(&rooms);
                 continue;
             }
             let connection = self.connection();
@@ -483,8 +565,10 @@ impl Cluster {
                 if let Err(error) = self.client.force_reconnect().await {
                     tracing::debug!(%error, "cannot connect anew");
                 }
+                self.give_up_empty(&rooms);
                 continue;
             }
+            lock(&self.leases).forget(Instant::now());
             if !self.is_cut.load(Ordering::SeqCst) {
                 self.renew(&rooms).await;
             }
@@ -496,11 +580,12 @@ impl Cluster {
     /// Tells other nodes of this one's rooms.
     async fn tell(&self, rooms: &Rooms) {
         let mut listed = rooms.list();
+        let is_partial = listed.len() > MOST_LISTED;
         listed.truncate(MOST_LISTED);
         let of = listed.len().div_ceil(LISTED_AT_ONCE).max(1);
         for part in 0..of {
             let rooms = listed.drain(..listed.len().min(LISTED_AT_ONCE)).collect();
-            let told = NodeListing { node: self.node.clone(), address: self.address.clone(), part, of, rooms };
+            let told = NodeListing { node: self.node.clone(), address: self.address.clone(), part, of, is_partial, rooms };
             let text = serde_json::to_vec(&told).expect("plain data can be written");
             if let Err(error) = self.client.publish(self.subject("listing"), text.into()).await {
                 tracing::debug!(%error, "listing not sent");
@@ -512,7 +597,7 @@ impl Cluster {
     /// bucket: for that `async-nats` asks for more of the account than a server of version 2.9 says.
     async fn make_buckets(&self) -> Result<Buckets, String> {
         let jetstream = async_nats::jetstream::new(self.client.clone());
-        let make = async |name: &str, max_message_size: i32| {
+        let make = async |name: &str, max_message_size: i32, max_bytes: i64| {
             let bucket = format!("{}_{name}", self.prefix.replace('.', "_"));
             let config = stream::Config {
                 name: format!("KV_{bucket}"),
@@ -520,8 +605,9 @@ impl Cluster {
                 max_messages_per_subject: 1,
                 max_age: KEPT_FOR,
                 max_message_size,
+                max_bytes,
                 num_replicas: self.replicas,
-                discard: stream::DiscardPolicy::New,
+                discard: stream::DiscardPolicy::Old,
                 allow_rollup: true,
                 deny_delete: true,
                 allow_direct: true,
@@ -530,7 +616,10 @@ impl Cluster {
             jetstream.get_or_create_stream(config).await.map_err(|error| error.to_string())?;
             jetstream.get_key_value(bucket).await.map_err(|error| error.to_string())
         };
-        Ok(Buckets { leases: make("leases", MOST_LEASE_BYTES).await?, kept: make("kept", MOST_KEPT_BYTES).await? })
+        Ok(Buckets {
+            leases: make("leases", MOST_LEASE_BYTES, ALL_LEASE_BYTES).await?,
+            kept: make("kept", MOST_KEPT_BYTES, ALL_KEPT_BYTES).await?,
+        })
     }
 
     /// What the cluster keeps of a room's slot.
@@ -541,16 +630,42 @@ impl Cluster {
     }
 
     /// Keeps what a room keeps of a slot, for whichever node its publisher comes to next.
-    pub fn keep(self: &Arc<Self>, room: &RoomName, slot: &str, kept: &Kept) {
-        let Some(buckets) = self.buckets.get().cloned() else { return };
-        let (key, text) = (format!("{room}.{slot}"), serde_json::to_vec(kept).expect("plain data can be written"));
-        tokio::spawn(async move {
-            match tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.put(&key, text.into())).await {
-                Ok(Ok(_)) => {}
-                Ok(Err(error)) => tracing::warn!(key, %error, "neutral face not kept in the cluster"),
-                Err(_) => tracing::warn!(key, "neutral face not kept in the cluster: no answer"),
-            }
-        });
+    pub fn keep(&self, room: &RoomName, slot: &str, kept: &Kept) {
+        let text = serde_json::to_vec(kept).expect("plain data can be written");
+        if !self.keeping.put(format!("{room}.{slot}"), text.into()) {
+            tracing::warn!(%room, slot, "neutral face not kept in the cluster: too many wait");
+        }
+    }
+
+    /// Keeps what there is to keep until the service ends.
+    async fn keep_all(self: Arc<Self>, mut shutdown: watch::Receiver<bool>) {
+        loop {
+            let taken = tokio::select! {
+                taken = self.keeping.take() => taken,
+                () = stopped(&mut shutdown) => return,
+            };
+            self.keep_these(taken).await;
+        }
+    }
+
+    /// Keeps what publishers have left in the last moment.
+    pub async fn keep_rest(&self) {
+        // Without NATS each would wait for its own time.
+        let _ = tokio::time::timeout(Duration::from_secs(1), self.keep_these(self.keeping.take_now())).await;
+    }
+
+    /// Done with all of them, so that the next value of any key comes behind them.
+    async fn keep_these(&self, taken: HashMap<String, Bytes>) {
+        if let Some(buckets) = self.buckets.get() {
+            let puts = taken.into_iter().map(async |(key, text)| {
+                match tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.put(&key, text)).await {
+                    Ok(Ok(_)) => {}
+                    Ok(Err(error)) => tracing::warn!(key, %error, "neutral face not kept in the cluster"),
+                    Err(_) => tracing::warn!(key, "neutral face not kept in the cluster: no answer"),
+                }
+            });
+            futures_util::stream::iter(puts).buffer_unordered(KEEPING_AT_ONCE).collect::<()>().await;
+        }
     }
 }
 
@@ -594,6 +709,17 @@ fn without_password(url: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn newest_of_each_key_is_kept() {
+        let keeping = Keeping::default();
+        for (key, value) in [("a", "1"), ("b", "2"), ("a", "3")] {
+            assert!(keeping.put(key.into(), value.into()));
+        }
+        assert_eq!(keeping.take().await, HashMap::from([("a".into(), "3".into()), ("b".into(), "2".into())]));
+        assert!((0..MOST_KEEPING).all(|k| keeping.put(k.to_string(), Bytes::new())));
+        assert!(!keeping.put("one more".into(), Bytes::new()) && keeping.put("7".into(), "new".into()));
+    }
 
     #[test]
     fn passwords_are_not_shown() {

@@ -1,12 +1,13 @@
 //! One publisher: its messages are read, solved, encoded and put into its room, in the order they come.
 
 use crate::answer::Answer;
+use crate::cluster::LeaseError;
 use crate::config::seconds;
 use crate::http::Pass;
 use crate::room::RoomError;
 use crate::service::{Hub, stopped};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end, send, send_json};
-use crate::source::{FrameError, OpenError, Sent, Source};
+use crate::source::{FrameError, OpenError, Prepared, Sent, Source};
 use futures_util::StreamExt;
 use rhytid_shared::view::PROTOCOL_VERSION;
 use rhytid_shared::{MessageError, PublishHello, PublishMessage, PublishReader, RoomName, TrackingFrame};
@@ -52,10 +53,13 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName, pass: &Pass) -
             Err(_) => return Err(refusal("hello_timeout", format!("no hello within {} seconds", timeouts.hello))),
         },
     };
-    if let Some(cluster) = &hub.cluster {
-        cluster.enter(&hub.rooms, room, &hello).await.map_err(|error| refusal(error.code(), error.to_string()))?;
-    }
-    let (source, evicted) = Source::open(hub, room, hello, Some(text)).map_err(not_opened)?;
+    let prepared = tokio::select! {
+        biased;
+        () = stopped(&mut shutdown) => return Err(Ending::shutdown().into()),
+        () = until(pass.expires) => return Err(Ending::token_expired().into()),
+        prepared = enter(hub, room, hello) => prepared?,
+    };
+    let (source, evicted) = Source::open(hub, room, prepared, Some(text)).map_err(|error| not_opened(error.into()))?;
     let heard = Heard::now();
     let mut session = Session::new(hub, pass, source, reader);
     Err(tokio::select! {
@@ -68,6 +72,19 @@ async fn publish(hub: &Hub, socket: &mut Socket, room: &RoomName, pass: &Pass) -
             refusal("idle", format!("nothing heard for {} seconds", timeouts.publisher_idle))
         }
     })
+}
+
+/// Makes this node the room's home, where there are others.
+async fn enter(hub: &Hub, room: &RoomName, hello: PublishHello) -> Result<Prepared, Stop> {
+    let Some(cluster) = &hub.cluster else {
+        let kept = hub.rooms.kept(room, &hello);
+        return Prepared::new(hub, hello, kept).map_err(not_opened);
+    };
+    let kept = cluster.find_kept(&hub.rooms, room, &hello).await;
+    // Before anybody at another node loses the room to it.
+    let prepared = Prepared::new(hub, hello, kept.clone()).map_err(not_opened)?;
+    cluster.enter(&hub.rooms, room, &prepared.hello, kept).await.map_err(not_entered)?;
+    Ok(prepared)
 }
 
 /// Reads up to the hello.
@@ -255,6 +272,14 @@ fn not_opened(error: OpenError) -> Stop {
             };
             Ending::error(code, ErrorMessage::new(refused.code(), refused.to_string())).into()
         }
+    }
+}
+
+/// The end of a publisher whose room cannot have its home here.
+fn not_entered(error: LeaseError) -> Stop {
+    match error {
+        LeaseError::Room(error) => not_opened(error.into()),
+        error => refusal(error.code(), error.to_string()),
     }
 }
 

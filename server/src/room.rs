@@ -4,7 +4,7 @@ mod listing;
 mod nodes;
 mod recorded;
 
-use crate::cluster::{Kept, Outlet, StateHead};
+use crate::cluster::{Kept, RoomOutlet, StateHead};
 use crate::metrics::Metrics;
 use crate::recording::{Item, Recorder, SessionEvent, Sink};
 use crate::solve::mix::Mixer;
@@ -133,7 +133,7 @@ pub(crate) struct Room {
     since: Instant,
     layout: PacketLayout,
     metrics: Arc<Metrics>,
-    outlet: Option<Outlet>,
+    outlet: Option<RoomOutlet>,
     interest: Option<watch::Sender<()>>,
 }
 
@@ -165,6 +165,10 @@ struct RoomState {
     is_home: bool,
     /// Epoch under which packets leave for other nodes; what comes under an older one is old.
     epoch: u64,
+    /// NATS has recorded that epoch: packets under one that it has not would shut out those of the true home.
+    is_shared: bool,
+    /// Until then on the room's clock, ns, other nodes get its packets: somebody watches there, or may.
+    wanted_until: u64,
     /// States that came before this node was the room's home: they are of another epoch.
     num_states_before: u64,
     /// What came from another node.
@@ -213,9 +217,10 @@ impl Rooms {
             return Err(RoomError::TooManyViewers { most: self.max_viewers });
         }
         state.num_viewers += 1;
+        let is_first = state.num_viewers == 1;
         drop(state);
         self.metrics.viewers.inc();
-        if let Some(interest) = &room.interest {
+        if let Some(interest) = room.interest.as_ref().filter(|_| is_first) {
             interest.send_replace(());
         }
         Ok(Viewing { slot: room.slot.subscribe(), room })
@@ -276,13 +281,18 @@ impl Rooms {
         self.find_or_make(&mut lock(&self.by_name), name)
     }
 
+    fn check_place(&self, by_name: &BTreeMap<RoomName, Arc<Room>>) -> Result<(), RoomError> {
+        if by_name.len() >= self.max_rooms {
+            return Err(RoomError::TooManyRooms { most: self.max_rooms });
+        }
+        Ok(())
+    }
+
     fn find_or_make(&self, by_name: &mut BTreeMap<RoomName, Arc<Room>>, name: &RoomName) -> Result<Arc<Room>, RoomError> {
         if let Some(room) = by_name.get(name) {
             return Ok(room.clone());
         }
-        if by_name.len() >= self.max_rooms {
-            return Err(RoomError::TooManyRooms { most: self.max_rooms });
-        }
+        self.check_place(by_name)?;
         let layout = PacketLayout::from(&*self.character);
         let room = Arc::new(Room {
             since: Instant::now(),
@@ -306,12 +316,14 @@ impl Rooms {
                 empty_since: Instant::now(),
                 is_home: self.others.is_none(),
                 epoch: 0,
+                is_shared: false,
+                wanted_until: 0,
                 num_states_before: 0,
                 fed: None,
             }),
             layout,
             metrics: self.metrics.clone(),
-            outlet: self.others.as_ref().map(|others| others.outlet.clone()),
+            outlet: self.others.as_ref().map(|others| others.outlet.of(name)),
             interest: self.others.as_ref().map(|others| others.interest.clone()),
         });
         by_name.insert(name.clone(), room.clone());
@@ -324,19 +336,21 @@ impl Rooms {
         lock(&self.by_name).get(name).cloned()
     }
 
-    /// What the room keeps for the slot of `hello`, of its tracker.
+    /// What the room keeps for the slot of `hello`, of its tracker, where it asks for that.
     pub fn kept(&self, name: &RoomName, hello: &PublishHello) -> Option<Kept> {
-        let room = self.find(name)?;
+        let room = self.find(name).filter(|_| hello.keep_neutral)?;
         let state = lock(&room.state);
         state.neutrals.get(&hello.slot.name).filter(|neutral| neutral.kept.tracker == hello.tracker()).map(|neutral| neutral.kept.clone())
     }
 
-    /// Removes rooms that have been without publisher and viewers for `idle`.
+    /// Removes rooms that have been without publisher and viewers for `idle`; among nodes, none whose home is here: its lease
+    /// is given back before.
     pub fn sweep(&self, idle: Duration) {
         let mut by_name = lock(&self.by_name);
         by_name.retain(|_, room| {
             let state = lock(&room.state);
-            !state.publishers.is_empty() || state.num_viewers > 0 || state.empty_since.elapsed() < idle
+            let is_led = self.others.is_some() && state.is_home;
+            is_led || !state.publishers.is_empty() || state.num_viewers > 0 || state.empty_since.elapsed() < idle
         });
         self.metrics.rooms.set(by_name.len() as i64);
     }
@@ -389,8 +403,10 @@ impl Drop for Viewing {
         let mut state = lock(&self.room.state);
         state.num_viewers -= 1;
         state.empty_since = Instant::now();
+        let is_last = state.num_viewers == 0;
+        drop(state);
         self.room.metrics.viewers.dec();
-        if let Some(interest) = &self.room.interest {
+        if let Some(interest) = self.room.interest.as_ref().filter(|_| is_last) {
             interest.send_replace(());
         }
     }
@@ -428,7 +444,19 @@ impl Publishing {
         let kind = state.encoder.encode(merged, &mut state.packet);
         state.num_states += 1;
         let index = state.num_states;
-        let bytes = Bytes::copy_from_slice(&state.packet);
+        let key_index = state.key.as_ref().filter(|_| kind == PacketKind::Delta).map_or(index, |key| key.index);
+        let outlet = self.room.outlet.as_ref().filter(|_| state.is_shared && nanos < state.wanted_until);
+        let bytes = match outlet {
+            // Written once, for other nodes and for the viewers here.
+            Some(outlet) => {
+                let message = StateHead { epoch: state.epoch, index, key_index }.message(&state.packet);
+                if !outlet.send(message.clone()) {
+                    self.room.metrics.drop_frames("slow_cluster", 1);
+                }
+                message.slice(StateHead::LENGTH..)
+            }
+            None => Bytes::copy_from_slice(&state.packet),
+        };
         if let Some(sink) = &state.recording {
             sink.put(nanos, Item::Packet(bytes.clone()));
         }
@@ -438,12 +466,6 @@ impl Publishing {
         };
         state.key = Some(key.clone());
         state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
-        if let Some(outlet) = &self.room.outlet {
-            let head = StateHead { epoch: state.epoch, index, key_index: key.index };
-            if !outlet.send(&self.room.name, head, &state.packet) {
-                self.room.metrics.drop_frames("slow_cluster", 1);
-            }
-        }
         // Under the lock, so that states stand in the slot in their order.
         self.room.slot.send_replace(Some(Arc::new(Latest { index, key, delta, json: OnceLock::new() })));
         true

@@ -200,6 +200,9 @@ pub async fn run(
     let cluster = match &config.cluster.nats {
         Some(url) => {
             let scheme = if identity.is_some() { "wss" } else { "ws" };
+            if config.cluster.advertise.is_none() && address.ip().is_unspecified() {
+                tracing::warn!(%address, "other nodes cannot send publishers here: say --cluster-advertise");
+            }
             let advertised = config.cluster.advertise.clone().unwrap_or_else(|| format!("{scheme}://{address}"));
             Some(Cluster::join(&config.cluster, url, advertised, &character.sha256).await?)
         }
@@ -288,6 +291,9 @@ pub async fn run(
     drop((app, hub));
     if tokio::time::timeout(SHUTDOWN_TIMEOUT, tasks_end.recv()).await.is_err() {
         tracing::warn!("some sockets did not close in time");
+    }
+    if let Some(cluster) = &cluster {
+        cluster.keep_rest().await;
     }
     Ok(())
 }

@@ -92,6 +92,47 @@ enum FitOwner {
     Control(oneshot::Sender<Told>),
 }
 
+/// A source that has yet to claim its slot: its hello leads to something.
+pub(crate) struct Prepared {
+    /// With the profile and settings in use.
+    pub hello: PublishHello,
+    pipeline: Pipeline,
+    /// The profile in use.
+    profile: Option<Profile>,
+    /// The neutral face that it starts from.
+    kept: Option<Calibration>,
+}
+
+impl Prepared {
+    /// Makes what solves the frames of a source with this hello, which starts from what is `kept` of its slot where it asks for
+    /// that and the tracker is the same.
+    pub fn new(hub: &Hub, mut hello: PublishHello, kept: Option<Kept>) -> Result<Self, OpenError> {
+        let kept = kept.filter(|kept| hello.keep_neutral && kept.tracker == hello.tracker());
+        let resumed = kept.as_ref().filter(|_| hello.resume.is_some()).and_then(|kept| kept.profile.clone());
+        if let Some(profile) = resumed {
+            // One who comes back in the middle finds everything as it was, also what has been changed since its first hello.
+            hello.settings = Settings::default();
+            hello.profile = Some(ProfileChoice::Given(Box::new(profile)));
+        }
+        let kept_profile = kept.as_ref().and_then(|kept| kept.profile.clone());
+        let kept = kept.map(|kept| kept.calibration);
+        let profile = match hello.profile.take() {
+            Some(ProfileChoice::Given(profile)) => Some(*profile),
+            Some(ProfileChoice::Named(name)) => match hub.profiles.named(&name) {
+                Some(profile) => Some((*profile).clone()),
+                None => return Err(UnknownProfile(name).into()),
+            },
+            None => match kept_profile {
+                Some(profile) => Some(profile),
+                None => hub.profiles.of_source(&hello.source).map(|profile| (*profile).clone()),
+            },
+        };
+        hello.profile = profile.clone().map(|profile| ProfileChoice::Given(Box::new(profile)));
+        let (pipeline, kept_neutral) = start(hub, &hello, kept.clone())?;
+        Ok(Self { hello, pipeline, profile, kept: kept.filter(|_| kept_neutral) })
+    }
+}
+
 /// A source that has claimed its slot; gives it back on drop.
 pub(crate) struct Source {
     place: Publishing,
@@ -117,32 +158,12 @@ pub(crate) struct Source {
 }
 
 impl Source {
-    /// Claims the slot that `hello` names; `sent` is the hello's text where the publisher sent one. The second value is done when another
-    /// publisher has taken it over.
-    pub fn open(hub: &Hub, room: &RoomName, mut hello: PublishHello, sent: Option<Utf8Bytes>) -> Result<(Self, Evicted), OpenError> {
-        let kept = hello.keep_neutral.then(|| hub.rooms.kept(room, &hello)).flatten();
-        let resumed = kept.as_ref().filter(|_| hello.resume.is_some()).and_then(|kept| kept.profile.clone());
-        if let Some(profile) = resumed {
-            // One who comes back in the middle finds everything as it was, also what has been changed since its first hello.
-            hello.settings = Settings::default();
-            hello.profile = Some(ProfileChoice::Given(Box::new(profile)));
-        }
-        let kept_profile = kept.as_ref().and_then(|kept| kept.profile.clone());
-        let kept = kept.map(|kept| kept.calibration);
-        let profile = match hello.profile.take() {
-            Some(ProfileChoice::Given(profile)) => Some(*profile),
-            Some(ProfileChoice::Named(name)) => match hub.profiles.named(&name) {
-                Some(profile) => Some((*profile).clone()),
-                None => return Err(UnknownProfile(name).into()),
-            },
-            None => match kept_profile {
-                Some(profile) => Some(profile),
-                None => hub.profiles.of_source(&hello.source).map(|profile| (*profile).clone()),
-            },
-        };
-        hello.profile = profile.clone().map(|profile| ProfileChoice::Given(Box::new(profile)));
-        // Before the slot is claimed: a hello that leads to nothing takes no slot from anybody.
-        let (mut pipeline, kept_neutral) = start(hub, &hello, kept.clone())?;
+    /// Claims the slot that its hello names; `sent` is the hello's text where the publisher sent one. The second value is done when
+    /// another publisher has taken it over. Whatever else could be wrong with a hello has been found before: one that leads to
+    /// nothing takes no slot from anybody.
+    pub fn open(hub: &Hub, room: &RoomName, prepared: Prepared, sent: Option<Utf8Bytes>) -> Result<(Self, Evicted), RoomError> {
+        let Prepared { hello, mut pipeline, profile, kept } = prepared;
+        let kept_neutral = kept.is_some();
         let (controls, waiting) = mpsc::channel(MOST_CONTROLS);
         let slot: Arc<str> = hello.slot.name.as_str().into();
         let reader = sent.is_none().then(|| {
@@ -157,7 +178,7 @@ impl Source {
                 slot: slot.to_string(),
                 source: hello.source.clone(),
                 under_way: false,
-                kept_neutral: kept.filter(|_| kept_neutral).map(Box::new),
+                kept_neutral: kept.map(Box::new),
                 profile: profile.clone().map(Box::new),
                 solve: Some(Box::new(hub.config.solve.clone())),
             };

@@ -6,6 +6,7 @@ const web = path.join(path.dirname(fileURLToPath(import.meta.url)), "../../clien
 const load = (name) => import(pathToFileURL(path.join(web, name)).href);
 const { PacketTimes, encodePoints } = await load("wire.js");
 const { Backoff } = await load("util.js");
+const { PublishLink } = await load("publish_link.js");
 const { PuppetFace } = await load("puppet_face.js");
 const { clockText, placeNow, sizeText } = await load("takes.js");
 const { SHAPES, label, mirrored } = await load("names.js");
@@ -32,6 +33,31 @@ points.forEach((value, i) => {
 check("points come back within half a step", worst <= 0.51 * step && step < 0.01, `${worst} of ${step}`);
 const flat = new DataView(encodePoints(new Float32Array(9).fill(5), 0).buffer);
 check("points that are all one make a frame too", flat.getFloat32(24, true) > 0 && flat.getUint16(28, true) === 0);
+
+// A publisher that comes back.
+const sockets = [];
+globalThis.location ??= { origin: "http://face.example" };
+globalThis.WebSocket = class {
+  sent = [];
+  constructor() { sockets.push(this); }
+  send(text) { this.sent.push(JSON.parse(text)); }
+  close() {}
+};
+const link = new PublishLink("demo", () => ({ source: "test" }), { state() {} });
+link.start();
+sockets[0].onopen();
+sockets[0].onmessage({ data: JSON.stringify({ type: "ready", session: 7 }) });
+await sockets[0].onclose();
+link.connect(false);
+sockets[1].onopen();
+const [firstHello, again] = [sockets[0].sent[0], sockets[1].sent[0]];
+check("a first hello is nobody's who comes back", !("resume" in firstHello) && !("keep_neutral" in firstHello), JSON.stringify(firstHello));
+check("who comes back names its own session", again.resume === 7 && again.keep_neutral === true && !again.takeover, JSON.stringify(again));
+link.stop();
+link.start();
+sockets[2].onopen();
+check("who starts anew takes nothing back", !("resume" in sockets[2].sent[0]));
+link.stop();
 
 // The play bar.
 check("times are minutes and seconds", clockText(0) === "0:00.0" && clockText(75.26) === "1:15.3" && clockText(59.96) === "1:00.0");

@@ -13,6 +13,8 @@ use tokio_tungstenite::tungstenite::Bytes;
 
 /// How often rooms are looked through, whatever is heard of them.
 const ROUND: Duration = Duration::from_secs(1);
+/// A room of which nothing comes is asked for this often.
+const QUIET: Duration = Duration::from_secs(1);
 /// A key packet is asked for at most this often.
 const ASK_SPACING: Duration = Duration::from_millis(100);
 
@@ -26,15 +28,15 @@ pub(super) async fn run(cluster: Arc<Cluster>, rooms: Weak<Rooms>) {
         let Some(rooms) = rooms.upgrade() else { return };
         let watched = rooms.watched();
         feeds.retain(|room, feed| {
-            let is_wanted = watched.iter().any(|known| known.name == *room) && !cluster.is_home(room) && !feed.is_finished();
+            let is_wanted = watched.contains_key(room) && !cluster.is_home(room) && !feed.is_finished();
             if !is_wanted {
                 feed.abort();
             }
             is_wanted
         });
-        for room in watched {
-            if !cluster.is_home(&room.name) && !feeds.contains_key(&room.name) {
-                feeds.insert(room.name.clone(), tokio::spawn(feed(cluster.clone(), room)));
+        for (name, room) in watched {
+            if !feeds.contains_key(&name) && !cluster.is_home(&name) {
+                feeds.insert(name, tokio::spawn(feed(cluster.clone(), room)));
             }
         }
     }
@@ -46,12 +48,21 @@ async fn feed(cluster: Arc<Cluster>, room: Arc<Room>) {
     homes.mark_changed();
     let mut asked = (None, 0);
     let mut asked_at: Option<Instant> = None;
+    let mut quiet_at = tokio::time::Instant::now() + QUIET;
     loop {
         let needs_key = tokio::select! {
             message = packets.next() => match message {
-                Some(message) => take(&room, &message.payload) == Fed::NeedsKey,
+                Some(message) => {
+                    quiet_at = tokio::time::Instant::now() + QUIET;
+                    take(&room, &message.payload) == Fed::NeedsKey
+                }
                 None => return,
             },
+            // Nothing is published, or the home does not know that somebody watches here, or what came last was lost.
+            () = tokio::time::sleep_until(quiet_at) => {
+                quiet_at = tokio::time::Instant::now() + QUIET;
+                true
+            }
             changed = homes.changed() => {
                 if changed.is_err() {
                     return;
@@ -107,9 +118,13 @@ mod tests {
 
     /// A node's rooms, and what leaves them for other nodes.
     fn node() -> (Arc<Rooms>, mpsc::Receiver<Outbound>, PacketLayout) {
+        node_that_tells(watch::Sender::new(()))
+    }
+
+    fn node_that_tells(interest: watch::Sender<()>) -> (Arc<Rooms>, mpsc::Receiver<Outbound>, PacketLayout) {
         let character = Arc::new(Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap());
         let (outlet, outbound) = mpsc::channel(64);
-        let others = Others { outlet: Outlet(outlet), interest: watch::Sender::new(()) };
+        let others = Others { outlet: Outlet { prefix: String::new(), outbound: outlet }, interest };
         let layout = PacketLayout::from(&*character);
         let metrics = Arc::new(Metrics::new());
         let recorder = Recorder::new(RecordConfig::default(), &character, metrics.clone(), mpsc::channel(1).0);
@@ -138,10 +153,10 @@ mod tests {
     #[test]
     fn what_comes_twice_late_or_under_an_older_epoch_is_not_shown() {
         let (home, mut outbound, layout) = node();
-        home.lead(&name(), 7, 0);
+        home.lead(&name(), 7, true, 0).unwrap();
         let _first = publish(&home, &layout, 3);
         let packets = sent(&mut outbound);
-        home.lead(&name(), 8, 1000);
+        home.lead(&name(), 8, true, 1000).unwrap();
         let _second = publish(&home, &layout, 1);
         let newer = sent(&mut outbound);
 
@@ -157,9 +172,70 @@ mod tests {
     }
 
     #[test]
+    fn nothing_leaves_under_an_epoch_that_others_do_not_know() {
+        let (home, mut outbound, layout) = node();
+        home.lead(&name(), 7, false, 0).unwrap();
+        let place = publish(&home, &layout, 2);
+        assert!(sent(&mut outbound).is_empty());
+        home.lead(&name(), 8, true, 0).unwrap();
+        assert!(place.publish(&FaceFrame { session: place.session, seq: 2, ..layout.frame_at_rest() }, None));
+        assert_eq!(sent(&mut outbound)[0].0.epoch, 8);
+    }
+
+    #[test]
+    fn interest_changes_with_the_first_viewer_and_the_last() {
+        let told = watch::Sender::new(());
+        let mut interest = told.subscribe();
+        let (rooms, ..) = node_that_tells(told);
+        let mut has_changed = || {
+            let has_changed = interest.has_changed().unwrap();
+            interest.mark_unchanged();
+            has_changed
+        };
+        let first = rooms.join(&name()).unwrap();
+        assert!(has_changed());
+        let second = rooms.join(&name()).unwrap();
+        drop(first);
+        assert!(!has_changed());
+        assert_eq!(rooms.watched().len(), 1);
+        drop(second);
+        assert!(has_changed());
+        assert!(rooms.watched().is_empty());
+    }
+
+    #[test]
+    fn room_is_not_swept_before_its_lease_is_given_back() {
+        let (rooms, ..) = node();
+        rooms.lead(&name(), 7, true, 5).unwrap();
+        rooms.sweep(Duration::ZERO);
+        assert_eq!(rooms.num_sessions(&name()), 5);
+        assert!(rooms.give_up(&name()));
+        rooms.sweep(Duration::ZERO);
+        assert!(rooms.find(&name()).is_none());
+    }
+
+    #[test]
+    fn node_that_was_no_home_does_not_shut_out_the_one_that_is() {
+        let (home, mut outbound, layout) = node();
+        home.lead(&name(), 9, true, 0).unwrap();
+        let _first = publish(&home, &layout, 1);
+        let false_packet = sent(&mut outbound).remove(0);
+        home.lead(&name(), 7, true, 1000).unwrap();
+        let _second = publish(&home, &layout, 1);
+        let packet = sent(&mut outbound).remove(0);
+
+        let (other, ..) = node();
+        let viewing = other.join(&name()).unwrap();
+        assert_eq!(viewing.room.feed(false_packet.0, false_packet.1), Fed::Taken);
+        assert_eq!(viewing.room.feed(packet.0, packet.1.clone()), Fed::Old);
+        other.follow(&name(), 7);
+        assert_eq!(viewing.room.feed(packet.0, packet.1), Fed::Taken);
+    }
+
+    #[test]
     fn what_cannot_be_read_goes_no_further_and_ends_nobody() {
         let (home, mut outbound, layout) = node();
-        home.lead(&name(), 7, 0);
+        home.lead(&name(), 7, true, 0).unwrap();
         let _place = publish(&home, &layout, 2);
         let packets = sent(&mut outbound);
         let (other, ..) = node();
@@ -179,7 +255,7 @@ mod tests {
     #[test]
     fn fresh_home_does_not_tell_what_it_was_told_as_its_own() {
         let (home, mut outbound, layout) = node();
-        home.lead(&name(), 7, 0);
+        home.lead(&name(), 7, true, 0).unwrap();
         let _place = publish(&home, &layout, 2);
         let (next, ..) = node();
         let viewing = next.join(&name()).unwrap();
@@ -187,7 +263,7 @@ mod tests {
             viewing.room.feed(head, packet);
         }
         assert!(next.newest(&name()).is_empty(), "it is not the home");
-        next.lead(&name(), 8, 1000);
+        next.lead(&name(), 8, true, 1000).unwrap();
         assert!(next.newest(&name()).is_empty(), "nothing was published here yet");
         let place = publish(&next, &layout, 2);
         assert!(place.session > 1000);
@@ -206,7 +282,7 @@ mod tests {
         let (rooms, _outbound, layout) = node();
         let claim = |resume| rooms.claim(&name(), SlotClaim { resume, ..SlotClaim::default() }, mpsc::channel(1).0, |_| Vec::new());
         assert_eq!(claim(None).err(), Some(RoomError::Elsewhere), "the room's home is not here");
-        rooms.lead(&name(), 7, 0);
+        rooms.lead(&name(), 7, true, 0).unwrap();
         let first = publish(&rooms, &layout, 1);
         assert_eq!(claim(Some(first.session + 1)).err(), Some(RoomError::Taken));
         let (second, _evicted) = claim(Some(first.session)).unwrap();

@@ -1,12 +1,13 @@
 //! Leases: which node is a room's home.
 
-use super::wire::{EnterAnswer, EnterQuestion, Lease};
-use super::{Cluster, GATHERING, Held, REQUEST_TIMEOUT, lock};
-use crate::room::Rooms;
+use super::wire::{EnterAnswer, EnterQuestion, Kept, Lease};
+use super::{Cluster, GATHERING, Held, KEPT_FOR, REQUEST_TIMEOUT, lock};
+use crate::room::{RoomError, Rooms};
 use async_nats::RequestErrorKind;
 use async_nats::jetstream::kv::{CreateErrorKind, Operation, UpdateErrorKind};
 use futures_util::StreamExt;
 use rhytid_shared::{PublishHello, RoomName};
+use std::collections::HashMap;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -20,6 +21,10 @@ const EMPTY_FOR: Duration = Duration::from_secs(2);
 const SESSIONS_AT_ONCE: u32 = 1000;
 /// A home that has so few of them left takes more.
 const SESSIONS_LEFT: u32 = 200;
+/// A lease is written again after this long: NATS forgets what is older than a day.
+const RENEWED_AFTER: Duration = Duration::from_secs(3600);
+/// Between looks for leases that are to be forgotten.
+const LOOKED_THROUGH_AFTER: Duration = Duration::from_secs(60);
 /// How long a home that does not answer may just be slow: only one who wants back what it had does not wait.
 const SLOW: Duration = Duration::from_secs(2);
 /// Between questions to a home that does not answer.
@@ -44,6 +49,9 @@ pub(crate) enum LeaseError {
     /// NATS does not answer as it should.
     #[error("the cluster does not answer: {0}")]
     Cluster(String),
+    /// It has no place here.
+    #[error(transparent)]
+    Room(#[from] RoomError),
     /// The service ends.
     #[error("this node is shutting down")]
     Leaving,
@@ -56,7 +64,42 @@ impl LeaseError {
             Self::Taken => "room_taken",
             Self::Elsewhere { .. } => "room_elsewhere",
             Self::Cluster(_) => "cluster",
+            Self::Room(error) => error.code(),
             Self::Leaving => "shutting_down",
+        }
+    }
+}
+
+/// The leases of all rooms as NATS has told of them.
+#[derive(Default)]
+pub(super) struct Leases {
+    by_room: HashMap<RoomName, (Lease, Instant)>,
+    /// When they were looked through.
+    looked: Option<Instant>,
+}
+
+impl Leases {
+    fn get(&self, room: &RoomName) -> Option<&Lease> {
+        self.by_room.get(room).map(|(lease, _)| lease)
+    }
+
+    fn remove(&mut self, room: &RoomName) {
+        self.by_room.remove(room);
+    }
+
+    /// Takes what NATS has told at `now`; true where the room's home or its epoch is another than before.
+    fn insert(&mut self, room: RoomName, lease: Lease, now: Instant) -> bool {
+        let home = (lease.node.clone(), lease.epoch);
+        let before = self.by_room.insert(room, (lease, now));
+        before.is_none_or(|(before, _)| (before.node, before.epoch) != home)
+    }
+
+    /// Forgets what NATS has forgotten by `now`, which tells nobody of that: leases that no home renews.
+    pub fn forget(&mut self, now: Instant) {
+        if self.looked.is_none_or(|looked| now.saturating_duration_since(looked) >= LOOKED_THROUGH_AFTER) {
+            self.looked = Some(now);
+            self.by_room.retain(|_, (_, told)| now.saturating_duration_since(*told) < KEPT_FOR);
+            self.by_room.shrink_to_fit();
         }
     }
 }
@@ -88,10 +131,53 @@ async fn within<T>(answer: impl Future<Output = T>) -> Option<T> {
     tokio::time::timeout(REQUEST_TIMEOUT, answer).await.ok()
 }
 
+impl Held {
+    /// Notes at `now` whether its room has a publisher; true where it has had none for long enough.
+    fn note_empty(&mut self, is_empty: bool, now: Instant) -> bool {
+        self.empty_since = is_empty.then(|| self.empty_since.unwrap_or(now));
+        self.is_empty(now)
+    }
+
+    /// Its room has had no publisher for long enough.
+    fn is_empty(&self, now: Instant) -> bool {
+        self.empty_since.is_some_and(|since| now.saturating_duration_since(since) >= EMPTY_FOR)
+    }
+
+    /// It is to be given back, claimed, or written again; `num_sessions` of its room have been.
+    fn is_due(&self, num_sessions: u32, now: Instant) -> bool {
+        let is_short = num_sessions.saturating_add(SESSIONS_LEFT) > self.lease.sessions;
+        self.is_empty(now) || self.revision.is_none() || is_short || now.saturating_duration_since(self.renewed) >= RENEWED_AFTER
+    }
+}
+
 impl Cluster {
-    /// Makes this node the home of `room` for the publisher of `hello`, with what the cluster keeps of its slot; or says whose it
-    /// is. Without NATS this node is it at once, until others can be asked.
-    pub async fn enter(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Result<(), LeaseError> {
+    /// What a publisher of `hello` finds kept of its slot where it asks for that: here, if this is the room's home, else in the
+    /// cluster.
+    pub async fn find_kept(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Option<Kept> {
+        let here = rooms.kept(room, hello);
+        if !hello.keep_neutral || self.is_home(room) && here.is_some() {
+            return here;
+        }
+        self.kept(room, &hello.slot.name).await.or(here)
+    }
+
+    /// Makes this node the home of `room` for the publisher of `hello`, with what is `kept` of its slot; or says whose it is.
+    /// Without NATS this node is it at once, until others can be asked.
+    pub async fn enter(
+        self: &Arc<Self>,
+        rooms: &Arc<Rooms>,
+        room: &RoomName,
+        hello: &PublishHello,
+        kept: Option<Kept>,
+    ) -> Result<(), LeaseError> {
+        let (cluster, rooms, room, hello) = (self.clone(), rooms.clone(), room.clone(), hello.clone());
+        // In a task of its own: who waits may go, and no lease shall be left without this node's knowing of it.
+        let entering = tokio::spawn(async move { cluster.enter_now(&rooms, &room, &hello, kept).await });
+        entering.await.unwrap_or(Err(LeaseError::Leaving))
+    }
+
+    async fn enter_now(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello, kept: Option<Kept>) -> Result<(), LeaseError> {
+        let _claiming = self.claiming.read().await;
         if self.is_leaving.load(Ordering::SeqCst) {
             return Err(LeaseError::Leaving);
         }
@@ -104,13 +190,11 @@ impl Cluster {
             None => true,
         };
         if is_new {
+            rooms.has_place(room)?;
             self.claim(rooms, room, hello).await?;
         }
         let slot = &hello.slot.name;
-        if hello.keep_neutral
-            && (is_new || !rooms.has_kept(room, slot))
-            && let Some(kept) = self.kept(room, slot).await
-        {
+        if let Some(kept) = kept.filter(|_| is_new || !rooms.has_kept(room, slot)) {
             rooms.restore(room, slot, kept);
         }
         Ok(())
@@ -136,7 +220,8 @@ impl Cluster {
         entering.insert(room.clone(), Entering::Asked);
         let (cluster, rooms, room, hello) = (self.clone(), rooms.clone(), room.clone(), hello.clone());
         tokio::spawn(async move {
-            let entered = cluster.enter(&rooms, &room, &hello).await;
+            let kept = cluster.find_kept(&rooms, &room, &hello).await;
+            let entered = cluster.enter_now(&rooms, &room, &hello, kept).await;
             let mut entering = lock(&cluster.entering);
             match entered {
                 Ok(()) => drop(entering.remove(&room)),
@@ -151,8 +236,7 @@ impl Cluster {
 
     async fn claim(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Result<(), LeaseError> {
         let Some(buckets) = self.buckets.get().filter(|_| self.problem().is_none()) else {
-            self.hold_alone(rooms, room);
-            return Ok(());
+            return self.hold_alone(rooms, room);
         };
         let question = EnterQuestion { room: room.to_string(), takeover: hello.takeover, resume: hello.resume };
         for _ in 0..MOST_TRIES {
@@ -160,10 +244,7 @@ impl Cluster {
                 Some(Ok(entry)) => entry,
                 Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
                 // NATS has gone in this moment.
-                None => {
-                    self.hold_alone(rooms, room);
-                    return Ok(());
-                }
+                None => return self.hold_alone(rooms, room),
             };
             let found = entry.filter(|entry| entry.operation == Operation::Put);
             let found = found.and_then(|entry| Some((entry.revision, serde_json::from_slice::<Lease>(&entry.value).ok()?)));
@@ -178,24 +259,23 @@ impl Cluster {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => continue,
                     Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                    None => {
-                        self.hold_alone(rooms, room);
-                        return Ok(());
-                    }
+                    None => return self.hold_alone(rooms, room),
                 },
                 None => match within(buckets.leases.create(room.as_str(), text_of(&lease))).await {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == CreateErrorKind::AlreadyExists => continue,
                     Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                    None => {
-                        self.hold_alone(rooms, room);
-                        return Ok(());
-                    }
+                    None => return self.hold_alone(rooms, room),
                 },
             };
             rooms.forget_kept(room);
-            self.hold(rooms, room, lease, Some(revision), first);
-            return Ok(());
+            return match self.hold(rooms, room, lease.clone(), Some(revision), first) {
+                Ok(()) => Ok(()),
+                Err(error) => {
+                    self.give_back(rooms, room, &lease, Some(revision)).await;
+                    Err(error)
+                }
+            };
         }
         Err(LeaseError::Taken)
     }
@@ -210,6 +290,7 @@ impl Cluster {
         let start = Instant::now();
         loop {
             match self.ask_home(lease, question).await {
+                _ if self.is_leaving.load(Ordering::SeqCst) => return Err(LeaseError::Leaving),
                 (Said::Yes, _) => return Ok(()),
                 (Said::No(answer), _) if answer.slots.iter().any(|taken| taken == slot) => return Err(LeaseError::Taken),
                 (Said::No(_), _) => return Err(LeaseError::Elsewhere { address: lease.address.clone() }),
@@ -243,20 +324,26 @@ impl Cluster {
     }
 
     /// Makes this node a room's home without asking anybody.
-    fn hold_alone(&self, rooms: &Rooms, room: &RoomName) {
+    fn hold_alone(&self, rooms: &Rooms, room: &RoomName) -> Result<(), LeaseError> {
         use std::hash::{BuildHasher, Hasher};
         let before = lock(&self.leases).get(room).cloned().unwrap_or_default();
         // Another node may do the same in this moment; their sessions shall not have the same numbers.
         let at_random = std::collections::hash_map::RandomState::new().build_hasher().finish() % 10_000;
         let first = before.sessions.max(rooms.num_sessions(room)).wrapping_add(SESSIONS_AT_ONCE * (1 + at_random as u32));
         let lease = self.own_lease(now_millis().max(before.epoch + 1), first.wrapping_add(SESSIONS_AT_ONCE));
-        self.hold(rooms, room, lease, None, first);
+        self.hold(rooms, room, lease, None, first)
     }
 
-    fn hold(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: Option<u64>, sessions: u32) {
-        rooms.lead(room, lease.epoch, sessions);
+    fn hold(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: Option<u64>, sessions: u32) -> Result<(), LeaseError> {
+        let mut held = lock(&self.held);
+        // Behind the lock: all that is held is given back.
+        if self.is_leaving.load(Ordering::SeqCst) {
+            return Err(LeaseError::Leaving);
+        }
+        rooms.lead(room, lease.epoch, revision.is_some(), sessions)?;
         tracing::info!(%room, epoch = lease.epoch, shared = revision.is_some(), "home of a room");
-        lock(&self.held).insert(room.clone(), Held { lease, revision, empty_since: None });
+        held.insert(room.clone(), Held { lease, revision, renewed: Instant::now(), empty_since: None });
+        Ok(())
     }
 
     /// Gives back what has no publisher any more, and claims what could not be claimed before.
@@ -265,10 +352,8 @@ impl Cluster {
         {
             let mut held = lock(&self.held);
             for (room, held) in held.iter_mut() {
-                let is_empty = rooms.slots(room).is_empty();
-                held.empty_since = if is_empty { Some(held.empty_since.unwrap_or_else(Instant::now)) } else { None };
-                let is_short = rooms.num_sessions(room).saturating_add(SESSIONS_LEFT) > held.lease.sessions;
-                if held.empty_since.is_some_and(|since| since.elapsed() >= EMPTY_FOR) || held.revision.is_none() || is_short {
+                held.note_empty(rooms.slots(room).is_empty(), Instant::now());
+                if held.is_due(rooms.num_sessions(room), Instant::now()) {
                     due.push((room.clone(), held.clone()));
                 }
             }
@@ -278,22 +363,48 @@ impl Cluster {
         futures_util::stream::iter(due).buffer_unordered(64).collect::<()>().await;
     }
 
+    /// Lets go of a room, unless a publisher has entered it, or is about to.
+    fn give_up(&self, rooms: &Rooms, room: &RoomName) -> Option<Held> {
+        let mut held = lock(&self.held);
+        let is_given_up = held.get(room).is_some_and(|held| held.is_empty(Instant::now())) && rooms.give_up(room);
+        if is_given_up { held.remove(room) } else { None }
+    }
+
+    /// Lets go of rooms without a publisher while NATS is away: what it has recorded of them binds nobody.
+    pub(super) fn give_up_empty(&self, rooms: &Rooms) {
+        for room in self.look_for_empty(rooms) {
+            self.give_up(rooms, &room);
+        }
+    }
+
+    /// Notes which rooms have no publisher; gives those that have been so for long enough.
+    fn look_for_empty(&self, rooms: &Rooms) -> Vec<RoomName> {
+        let mut held = lock(&self.held);
+        held.iter_mut()
+            .filter_map(|(room, held)| held.note_empty(rooms.slots(room).is_empty(), Instant::now()).then(|| room.clone()))
+            .collect()
+    }
+
     async fn renew_one(&self, rooms: &Rooms, room: &RoomName, held: Held) {
         let Some(buckets) = self.buckets.get() else { return };
-        if held.empty_since.is_some_and(|since| since.elapsed() >= EMPTY_FOR) {
-            if rooms.give_up(room) {
-                lock(&self.held).remove(room);
-                self.give_back(rooms, room, &held).await;
+        if held.is_empty(Instant::now()) {
+            if let Some(held) = self.give_up(rooms, room) {
+                self.give_back(rooms, room, &held.lease, held.revision).await;
             }
             return;
         }
         if let Some(revision) = held.revision {
             let lease = Lease { sessions: rooms.num_sessions(room).wrapping_add(SESSIONS_AT_ONCE), ..held.lease };
-            // Who has taken it meanwhile is heard of by the watch.
-            if let Some(Ok(revision)) = within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await
-                && let Some(held) = lock(&self.held).get_mut(room)
-            {
-                (held.lease, held.revision) = (lease, Some(revision));
+            let renewed = within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await;
+            let mut held = lock(&self.held);
+            // Who has taken it meanwhile is heard of by the watch, too.
+            let Some(held) = held.get_mut(room).filter(|held| held.revision == Some(revision)) else { return };
+            match renewed {
+                Some(Ok(revision)) => (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now()),
+                // Its record is another, or is gone: it is claimed anew.
+                Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => held.revision = None,
+                Some(Err(error)) => tracing::debug!(%room, %error, "lease not renewed"),
+                None => tracing::debug!(%room, "lease not renewed: no answer"),
             }
             return;
         }
@@ -330,15 +441,19 @@ impl Cluster {
     /// What was held alone is held before all.
     fn confirm(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: u64) {
         if let Some(held) = lock(&self.held).get_mut(room) {
-            rooms.lead(room, lease.epoch, 0);
+            if let Err(error) = rooms.lead(room, lease.epoch, true, 0) {
+                return tracing::warn!(%room, %error, "it is not there any more");
+            }
             tracing::info!(%room, epoch = lease.epoch, "home of a room before all nodes");
-            (held.lease, held.revision) = (lease, Some(revision));
+            (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now());
         }
     }
 
-    async fn give_back(&self, rooms: &Rooms, room: &RoomName, held: &Held) {
-        let (Some(buckets), Some(revision)) = (self.buckets.get(), held.revision) else { return };
-        let free = Lease { node: String::new(), address: String::new(), sessions: rooms.num_sessions(room), epoch: held.lease.epoch };
+    async fn give_back(&self, rooms: &Rooms, room: &RoomName, lease: &Lease, revision: Option<u64>) {
+        let (Some(buckets), Some(revision)) = (self.buckets.get(), revision) else { return };
+        // As many as may have been, where there is no such room any more.
+        let sessions = rooms.num_sessions(room).max(lease.sessions.saturating_sub(SESSIONS_AT_ONCE));
+        let free = Lease { node: String::new(), address: String::new(), sessions, epoch: lease.epoch };
         match within(buckets.leases.update(room.as_str(), text_of(&free), revision)).await {
             Some(Ok(_)) => {}
             // Another has taken it meanwhile, or finds that nobody answers for it.
@@ -365,6 +480,10 @@ impl Cluster {
             let lease: Option<Lease> = if entry.operation == Operation::Put { serde_json::from_slice(&entry.value).ok() } else { None };
             let Some(lease) = lease else {
                 lock(&self.leases).remove(&room);
+                // Not by a node: then who holds it claims it anew.
+                if let Some(held) = lock(&self.held).get_mut(&room).filter(|held| held.revision.is_some_and(|own| own < entry.revision)) {
+                    held.revision = None;
+                }
                 continue;
             };
             let is_lost = {
@@ -373,10 +492,14 @@ impl Cluster {
             };
             if is_lost {
                 self.lose(&rooms, &room, lease.epoch);
+            } else if lease.node != self.node {
+                rooms.follow(&room, lease.epoch);
             }
-            lock(&self.leases).insert(room, lease);
-            self.homes.send_replace(());
-            self.interest.send_replace(());
+            // Every home writes its leases again now and then.
+            if lock(&self.leases).insert(room, lease, Instant::now()) {
+                self.homes.send_replace(());
+                self.interest.send_replace(());
+            }
         }
     }
 
@@ -394,13 +517,50 @@ impl Cluster {
     pub async fn leave(&self, rooms: &Rooms) {
         self.is_leaving.store(true, Ordering::SeqCst);
         let all: Vec<_> = lock(&self.held).drain().collect();
-        let giving = all.iter().map(|(room, held)| self.give_back(rooms, room, held));
+        let giving = all.iter().map(|(room, held)| self.give_back(rooms, room, &held.lease, held.revision));
         let giving = futures_util::stream::iter(giving).buffer_unordered(64).collect::<()>();
+        let all = async {
+            giving.await;
+            // What is being claimed in this moment is given back there.
+            drop(self.claiming.write().await);
+        };
         // Whoever comes for the rest finds that nobody answers.
-        let _ = tokio::time::timeout(Duration::from_secs(1), giving).await;
+        let _ = tokio::time::timeout(Duration::from_secs(1), all).await;
     }
 }
 
 fn text_of(lease: &Lease) -> Bytes {
     serde_json::to_vec(lease).expect("plain data can be written").into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lease_is_written_again_long_before_nats_forgets_it() {
+        let now = Instant::now();
+        let lease = Lease { sessions: 1000, ..Lease::default() };
+        let held = Held { lease, revision: Some(1), renewed: now, empty_since: None };
+        let half_an_hour = now + Duration::from_secs(1800);
+        assert!(!held.is_due(800, half_an_hour));
+        assert!(held.is_due(801, half_an_hour), "few sessions are left");
+        assert!(held.is_due(0, now + KEPT_FOR / 12));
+        assert!(Held { revision: None, ..held.clone() }.is_due(0, now));
+        let empty = Held { empty_since: Some(now), ..held };
+        assert!(!empty.is_due(0, now + EMPTY_FOR / 2) && empty.is_due(0, now + EMPTY_FOR));
+    }
+
+    #[test]
+    fn lease_that_no_home_renews_is_forgotten() {
+        let (start, mut leases) = (Instant::now(), Leases::default());
+        let [old, renewed] = ["old", "renewed"].map(|name| RoomName::new(name).unwrap());
+        let lease = Lease { node: "a".into(), epoch: 1, ..Lease::default() };
+        assert!(leases.insert(old.clone(), lease.clone(), start) && leases.insert(renewed.clone(), lease.clone(), start));
+        leases.forget(start + KEPT_FOR / 2);
+        assert!(leases.get(&old).is_some());
+        assert!(!leases.insert(renewed.clone(), Lease { sessions: 1000, ..lease }, start + KEPT_FOR / 2), "it says nothing new");
+        leases.forget(start + KEPT_FOR);
+        assert_eq!((leases.get(&old), leases.by_room.len()), (None, 1));
+    }
 }

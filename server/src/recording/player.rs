@@ -254,7 +254,7 @@ impl Players {
         if let Some(cluster) = &hub.cluster {
             // Last of all: another node's publisher has to go only for what can be played.
             let hello = PublishHello { source: source_of(&file), takeover: request.takeover, ..PublishHello::default() };
-            let entered = cluster.enter(&hub.rooms, room, &hello).await;
+            let entered = cluster.enter(&hub.rooms, room, &hello, None).await;
             entered.map_err(|error| PlayError::Room { code: error.code(), problem: error.to_string() })?;
         }
         self.seat(hub, room, file, recording, &request, most_standing)

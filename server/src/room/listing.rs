@@ -12,7 +12,7 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RoomListing {
     pub name: String,
-    viewers: usize,
+    pub viewers: usize,
     /// Publishers the room has had.
     session: u32,
     /// The one of the highest priority.
@@ -78,6 +78,13 @@ impl Rooms {
     pub fn list(&self) -> Vec<RoomListing> {
         let rooms: Vec<Arc<Room>> = lock(&self.by_name).values().cloned().collect();
         rooms.iter().map(|room| room.listing()).collect()
+    }
+}
+
+impl RoomListing {
+    /// Its node needs its packets.
+    pub fn is_wanted(&self) -> bool {
+        self.viewers > 0 || self.recording.as_ref().is_some_and(|recording| recording.error.is_none())
     }
 }
 

@@ -1,19 +1,23 @@
 //! Rooms among nodes: which of them is a room's home, what goes to the others and what comes from them.
 
-use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, Rooms, lock};
+use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomError, RoomState, Rooms, lock};
 use crate::cluster::{Kept, Outlet, StateHead};
 use rhytid_shared::packet::{Decoder, PacketKind};
 use rhytid_shared::{FaceFrame, RoomName};
+use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio_tungstenite::tungstenite::Bytes;
+
+/// Packets go to other nodes for so long after one of them has told that it watches, which each does twice a second.
+const WANTED_FOR: Duration = Duration::from_secs(3);
 
 /// What rooms need of other nodes.
 pub(crate) struct Others {
     /// Where packets leave for them.
     pub outlet: Outlet,
-    /// Told when a room's viewers come or go.
+    /// Told when a room's first viewer comes, or its last one goes.
     pub interest: watch::Sender<()>,
 }
 
@@ -40,6 +44,12 @@ pub(crate) enum Fed {
 }
 
 impl Rooms {
+    /// Whether there is a room of this name, or could be.
+    pub fn has_place(&self, name: &RoomName) -> Result<(), RoomError> {
+        let by_name = lock(&self.by_name);
+        if by_name.contains_key(name) { Ok(()) } else { self.check_place(&by_name) }
+    }
+
     /// True where something is kept of a room's slot.
     pub fn has_kept(&self, name: &RoomName, slot: &str) -> bool {
         self.find(name).is_some_and(|room| lock(&room.state).neutrals.contains_key(slot))
@@ -75,7 +85,10 @@ impl Rooms {
     /// A room's newest state as messages for another node: the key packet, and the delta where there is one.
     pub fn newest(&self, name: &RoomName) -> Vec<Bytes> {
         let Some(room) = self.find(name) else { return Vec::new() };
-        let state = lock(&room.state);
+        let mut guard = lock(&room.state);
+        let state = &mut *guard;
+        // Who asks watches, and gets from here on whatever comes.
+        room.want(state);
         let is_own = |latest: &Arc<Latest>| state.is_home && latest.key.index > state.num_states_before;
         let Some(latest) = room.slot.borrow().clone().filter(is_own) else { return Vec::new() };
         let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
@@ -86,16 +99,44 @@ impl Rooms {
         })
     }
 
-    /// This node is a room's home from now on, under `epoch`; others may have had `sessions` sessions of it.
-    pub fn lead(&self, name: &RoomName, epoch: u64, sessions: u32) {
-        let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };
+    /// This node is a room's home from now on, under `epoch`, which others know of where it `is_shared`; they may have had
+    /// `sessions` sessions of it.
+    pub fn lead(&self, name: &RoomName, epoch: u64, is_shared: bool, sessions: u32) -> Result<(), RoomError> {
+        let room = self.find_or_make(&mut lock(&self.by_name), name)?;
         let mut state = lock(&room.state);
         if !std::mem::replace(&mut state.is_home, true) {
             state.num_states_before = state.num_states;
             room.end_fed(&mut state);
         }
-        state.epoch = epoch;
+        (state.epoch, state.is_shared) = (epoch, is_shared);
+        // It is not known yet who watches.
+        room.want(&mut state);
         state.num_sessions = state.num_sessions.max(sessions);
+        Ok(())
+    }
+
+    /// Another node is a room's home under `epoch`: what was shown under a greater one came from a node that was none.
+    pub fn follow(&self, name: &RoomName, epoch: u64) {
+        let Some(room) = self.find(name) else { return };
+        let mut state = lock(&room.state);
+        if !state.is_home && state.epoch > epoch {
+            state.follow(epoch);
+        }
+    }
+
+    /// Another node watches the rooms of these names, or may watch `all`, where it could not name each.
+    pub fn want<'a>(&self, all: bool, names: impl Iterator<Item = &'a str>) {
+        let rooms: Vec<Arc<Room>> = {
+            let by_name = lock(&self.by_name);
+            if all {
+                by_name.values().cloned().collect()
+            } else {
+                names.filter_map(|name| by_name.get(&RoomName::new(name).ok()?).cloned()).collect()
+            }
+        };
+        for room in rooms {
+            room.want(&mut lock(&room.state));
+        }
     }
 
     /// This node is a room's home no longer, unless somebody publishes to it.
@@ -115,10 +156,7 @@ impl Rooms {
         state.is_home = false;
         if let Some(epoch) = epoch {
             // Where both were cut off from each other, this one's may be the greater.
-            state.epoch = epoch;
-            if state.fed.as_ref().is_some_and(|fed| fed.head.epoch > epoch) {
-                state.fed = None;
-            }
+            state.follow(epoch);
         }
         for publisher in std::mem::take(&mut state.publishers) {
             room.record(&state, || publisher.end());
@@ -132,12 +170,29 @@ impl Rooms {
     }
 
     /// Rooms that somebody watches or records here.
-    pub fn watched(&self) -> Vec<Arc<Room>> {
-        lock(&self.by_name).values().filter(|room| lock(&room.state).is_wanted()).cloned().collect()
+    pub fn watched(&self) -> HashMap<RoomName, Arc<Room>> {
+        let by_name = lock(&self.by_name);
+        let watched = by_name.iter().filter(|(_, room)| lock(&room.state).is_wanted());
+        watched.map(|(name, room)| (name.clone(), room.clone())).collect()
+    }
+}
+
+impl RoomState {
+    /// Takes packets from `epoch` on.
+    fn follow(&mut self, epoch: u64) {
+        self.epoch = epoch;
+        if self.fed.as_ref().is_some_and(|fed| fed.head.epoch > epoch) {
+            self.fed = None;
+        }
     }
 }
 
 impl Room {
+    /// Somebody watches at another node, or may.
+    fn want(&self, state: &mut RoomState) {
+        state.wanted_until = self.nanos().saturating_add(WANTED_FOR.as_nanos() as u64);
+    }
+
     /// Takes a packet that came from the room's home at another node.
     pub fn feed(&self, head: StateHead, packet: Bytes) -> Fed {
         let mut guard = lock(&self.state);

@@ -11,7 +11,7 @@ use crate::config::seconds;
 use crate::publish::Rate;
 use crate::room::Evicted;
 use crate::service::{Hub, ServerError, stopped};
-use crate::source::{FrameError, OpenError, Source};
+use crate::source::{FrameError, OpenError, Prepared, Source};
 use rhytid_shared::{RoomName, Slot};
 use serde::Serialize;
 use std::collections::HashMap;
@@ -449,7 +449,9 @@ impl<'a> Listener<'a> {
         // The same tracker that begins anew sees the same face.
         hello.keep_neutral = num_sessions > 0;
         hello.slot = slot;
-        let begun = Source::open(self.hub, &room, hello, None);
+        let kept = self.hub.rooms.kept(&room, &hello);
+        let begun = Prepared::new(self.hub, hello, kept)
+            .and_then(|prepared| Source::open(self.hub, &room, prepared, None).map_err(OpenError::from));
         let performer = self.performers.get_mut(key).expect("sessions are of performers");
         match begun {
             Ok((source, evicted)) => {

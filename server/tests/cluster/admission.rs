@@ -2,11 +2,20 @@
 
 use super::nats::Nats;
 use super::nodes::{HELLO, Node};
+use super::process::wait_for;
 use super::watch::Watch;
 use serde_json::{Value, json};
 use std::time::Duration;
 
-pub fn password_and_certificates() {
+/// An authority, and a certificate of this machine that it has signed.
+struct Certificates {
+    _folder: tempfile::TempDir,
+    ca: String,
+    cert: String,
+    key: String,
+}
+
+fn certificates() -> Certificates {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
     let (authority_key, key) = (rcgen::KeyPair::generate().unwrap(), rcgen::KeyPair::generate().unwrap());
@@ -20,6 +29,27 @@ pub fn password_and_certificates() {
     std::fs::write(path("cert.pem"), cert.pem()).unwrap();
     std::fs::write(path("key.pem"), key.serialize_pem()).unwrap();
     let (ca, cert, key) = (path("ca.pem"), path("cert.pem"), path("key.pem"));
+    Certificates { _folder: folder, ca, cert, key }
+}
+
+pub fn own_certificate() {
+    let Certificates { _folder, ca, cert, key } = certificates();
+    let nats = Nats::with(&["--tlsverify", "--tlscacert", &ca, "--tlscert", &cert, "--tlskey", &key]);
+    let url = format!("tls://127.0.0.1:{}", nats.port);
+    let with_ca = ["--cluster-ca", &ca];
+    let a = Node::with(&url, &[&with_ca[..], &["--cluster-cert", &cert, "--cluster-key", &key]].concat()).ready();
+    a.publisher("demo", HELLO).ready();
+    // Shown one that its authority has not signed.
+    let other = certificates();
+    for more in [&[][..], &["--cluster-cert", &other.cert, "--cluster-key", &other.key]] {
+        let outside = Node::with(&url, &[&with_ca[..], more].concat());
+        std::thread::sleep(Duration::from_millis(500));
+        assert!(outside.get("/healthz").unwrap().starts_with("degraded"), "{more:?}");
+    }
+}
+
+pub fn password_and_certificates() {
+    let Certificates { _folder, ca, cert, key } = certificates();
     let nats = Nats::with(&["--tls", "--tlscert", &cert, "--tlskey", &key, "--user", "node", "--pass", "s3cret"]);
     let url = |word: &str| format!("tls://node:{word}@127.0.0.1:{}", nats.port);
     let a = Node::with(&url("s3cret"), &["--cluster-ca", &ca]).ready();
@@ -34,6 +64,18 @@ pub fn password_and_certificates() {
         assert!(!outside.log().contains("s3cret"), "passwords are not logged");
     }
     watch.finish();
+}
+
+pub fn advertised_address() {
+    let nats = Nats::start();
+    let everywhere = ["--listen", "0.0.0.0:0", "--insecure"];
+    let warning = "--cluster-advertise";
+    let silent = Node::with(&nats.url(), &everywhere).ready();
+    assert!(silent.log().contains(warning), "{}", silent.log());
+    let named = "wss://face.example:7879";
+    let telling = Node::with(&nats.url(), &[&everywhere[..], &["--cluster-advertise", named]].concat()).ready();
+    assert!(!telling.log().contains(warning), "{}", telling.log());
+    wait_for("its address", || silent.rooms()["nodes"].as_object().unwrap().values().any(|address| address == named).then_some(()));
 }
 
 /// Text of a JSON Web Token as NATS signs it.

@@ -120,10 +120,27 @@ impl Publisher {
         self
     }
 
+    /// The last message of a server that ends the session.
+    pub fn last_answer(&mut self) -> Value {
+        let mut last = Value::Null;
+        loop {
+            match self.socket.read() {
+                Ok(Message::Text(text)) => last = serde_json::from_str(&text).unwrap(),
+                Ok(Message::Close(_)) | Err(_) => return last,
+                Ok(_) => {}
+            }
+        }
+    }
+
     pub fn frame(&mut self, jaw: f64) {
+        assert!(self.try_frame(jaw), "the session has ended");
+    }
+
+    /// False where the session has ended.
+    pub fn try_frame(&mut self, jaw: f64) -> bool {
         self.t += 1.0 / 60.0;
         let frame = json!({ "type": "frame", "t": self.t, "weights": { "jawOpen": jaw, "browInnerUp": 0.5 } });
-        self.socket.send(Message::text(frame.to_string())).unwrap();
+        self.socket.send(Message::text(frame.to_string())).is_ok()
     }
 }
 

@@ -7,6 +7,7 @@ use super::process::{Process, wait_for};
 use super::senders::{send, write_feed};
 use super::signal::{Signal, signal};
 use super::watch::{Watch, num_twice, pause};
+use futures_util::TryStreamExt;
 use serde_json::Value;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -129,6 +130,119 @@ pub fn nats_dies() {
     assert!(pause(&near) < Duration::from_millis(700), "the room's own viewer: {:?}", pause(&near));
     let sessions = near.iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();
     assert_eq!((sessions.len(), num_twice(&near), num_twice(&far.finish())), (1, 0, 0));
+}
+
+/// Two nodes open one room while NATS is away; the viewer at a third one sees the one that keeps it, and never the other.
+pub fn two_homes() {
+    let mut cluster = Cluster::start();
+    let folder = cluster.folder.clone();
+    let feed = write_feed(folder.path(), 60);
+    let (a, b, c) = (&cluster.nodes[0], &cluster.nodes[1], &cluster.nodes[2]);
+    let _sender = send(&feed, &[&a.address], "demo", &folder.path().join("send.log"));
+    let (demo, fresh) = (Watch::start(&[&c.address], "demo"), Watch::start(&[&c.address], "fresh"));
+    demo.wait_for_more("a face elsewhere");
+    cluster.nats.kill();
+    for node in [a, b, c] {
+        wait_for("the health to tell it", || node.get("/healthz").unwrap().starts_with("degraded").then_some(()));
+    }
+    // One room was the first node's before, the other is nobody's.
+    let mut second_demo = b.publisher("demo", HELLO).ready();
+    let mut two = [a, b].map(|node| node.publisher("fresh", HELLO).ready());
+    second_demo.frame(0.3);
+    two.iter_mut().for_each(|publisher| publisher.frame(0.3));
+    cluster.nats.restart();
+    let start = Instant::now();
+    let has_lost = |node: &Node, room: &str| node.log().lines().any(|line| line.contains("home now") && line.contains(room));
+    // They go on sending, so that a loser's packets would be seen.
+    wait_for("one home for each room", || {
+        second_demo.try_frame(0.4);
+        for publisher in &mut two {
+            publisher.try_frame(0.4);
+        }
+        std::thread::sleep(Duration::from_millis(10));
+        (has_lost(b, "demo") && (has_lost(a, "fresh") || has_lost(b, "fresh"))).then_some(())
+    });
+    println!("two homes: each room has one after {:?}", start.elapsed());
+    assert!(!has_lost(a, "demo"), "the node that had it before keeps it");
+    let kept = usize::from(has_lost(a, "fresh"));
+    for loser in [&mut second_demo, &mut two[1 - kept]] {
+        let told = loser.last_answer();
+        assert_eq!(told["code"], "taken_over", "{told}");
+    }
+    let before = Instant::now();
+    wait_for("the face elsewhere", || {
+        two[kept].frame(0.5);
+        let is_seen = |watch: &Watch| watch.last().is_some_and(|seen| seen.at > before);
+        (is_seen(&demo) && is_seen(&fresh)).then_some(())
+    });
+    let sessions = demo.finish().iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();
+    assert_eq!(sessions.len(), 1, "the other's packets went nowhere: {sessions:?}");
+    let sessions = fresh.finish().iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();
+    assert_eq!(sessions.len(), 1, "the loser's packets went nowhere: {sessions:?}");
+}
+
+/// A node starts while NATS is away and opens a room that lives; when NATS is back, it is there before the room's home is.
+pub fn late_node() {
+    let mut nats = Nats::start();
+    let a = Node::start(&nats.url()).ready();
+    let mut publisher = a.publisher("demo", HELLO).ready();
+    nats.kill();
+    let late = Node::start(&nats.url());
+    let mut other = late.publisher("demo", HELLO).ready();
+    signal(&a.process, Signal::STOP);
+    nats.restart();
+    wait_for("the late node's joining", || (late.get("/healthz").unwrap() == "ok\n").then_some(()));
+    // Some rounds in which it asks who does not answer.
+    std::thread::sleep(Duration::from_millis(1200));
+    signal(&a.process, Signal::CONT);
+    let told = other.last_answer();
+    assert_eq!(told["code"], "taken_over", "{told}");
+    publisher.frame(0.3);
+    let mut viewer = late.viewer("demo");
+    publisher.frame(0.4);
+    viewer.packet();
+    assert!(!a.log().contains("another node is the room's home now"));
+}
+
+/// A node ends while it asks for a room whose home does not answer.
+pub fn leaves_while_it_asks() {
+    let mut cluster = Cluster::start();
+    let _first = cluster.nodes[0].publisher("demo", HELLO).ready();
+    signal(&cluster.nodes[0].process, Signal::STOP);
+    let mut waiting = cluster.nodes[1].publisher("demo", HELLO);
+    // It asks for two seconds.
+    std::thread::sleep(Duration::from_millis(500));
+    signal(&cluster.nodes[1].process, Signal::TERM);
+    // It is told as it waits, or by the one who asks for it.
+    let told = waiting.last_answer();
+    assert!(told.is_null() || told["code"] == "shutting_down", "it is not let in any more: {told}");
+    assert!(cluster.nodes[1].process.wait().unwrap().success());
+    assert!(!cluster.nodes[1].log().contains("home of a room"), "it takes no room that it cannot have");
+    signal(&cluster.nodes[0].process, Signal::CONT);
+}
+
+/// A lease vanishes from NATS while its home lives.
+pub fn lost_lease() {
+    let cluster = Cluster::start();
+    let [a, b, _] = &cluster.nodes[..] else { unreachable!() };
+    let mut publisher = a.publisher("demo", HELLO).ready();
+    let num_claimed = || a.log().lines().filter(|line| line.contains("home of a room") && line.contains("demo")).count();
+    wait_for("the lease", || (num_claimed() == 1).then_some(()));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let jetstream = async_nats::jetstream::new(async_nats::connect(cluster.nats.url()).await.unwrap());
+        let bucket = jetstream.stream_names().try_filter(|name| std::future::ready(name.ends_with("_leases")));
+        let [bucket] = &bucket.try_collect::<Vec<_>>().await.unwrap()[..] else { panic!("one bucket of leases") };
+        let leases = jetstream.get_key_value(bucket.strip_prefix("KV_").unwrap()).await.unwrap();
+        leases.purge("demo").await.unwrap();
+    });
+    wait_for("another claim", || (num_claimed() == 2).then_some(()));
+    let refused = b.publisher("demo", HELLO).answer();
+    assert_eq!(refused["code"], "room_taken", "{refused}");
+    publisher.frame(0.3);
+    let mut viewer = b.viewer("demo");
+    publisher.frame(0.4);
+    viewer.packet();
 }
 
 pub fn rolling_restart() {
