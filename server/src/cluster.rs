@@ -14,7 +14,7 @@ use crate::room::{Others, RoomListing, Rooms};
 use crate::service::stopped;
 use async_nats::connection::State;
 use async_nats::jetstream::{kv, stream};
-use async_nats::{Client, ConnectOptions, Event};
+use async_nats::{Client, ConnectOptions, Event, Subject};
 use futures_util::StreamExt;
 use rhytid_shared::RoomName;
 use serde::Deserialize;
@@ -125,19 +125,39 @@ pub enum ClusterError {
 /// A packet on its way to other nodes.
 struct Outbound {
     since: Instant,
-    room: RoomName,
+    subject: Subject,
     message: Bytes,
 }
 
-/// Where a room's packets leave for other nodes.
+/// Where packets leave for other nodes.
 #[derive(Clone)]
-pub(crate) struct Outlet(mpsc::Sender<Outbound>);
+pub(crate) struct Outlet {
+    prefix: String,
+    outbound: mpsc::Sender<Outbound>,
+}
 
 impl Outlet {
-    /// Sends a packet without waiting; false where it found no place.
-    pub fn send(&self, room: &RoomName, head: StateHead, packet: &[u8]) -> bool {
-        self.0.try_send(Outbound { since: Instant::now(), room: room.clone(), message: head.message(packet) }).is_ok()
+    /// Where a room's packets leave.
+    pub fn of(&self, room: &RoomName) -> RoomOutlet {
+        RoomOutlet { subject: packets_of(&self.prefix, room), outbound: self.outbound.clone() }
     }
+}
+
+/// Where one room's packets leave for other nodes.
+pub(crate) struct RoomOutlet {
+    subject: Subject,
+    outbound: mpsc::Sender<Outbound>,
+}
+
+impl RoomOutlet {
+    /// Sends a [`StateHead::message`] without waiting; false where it found no place.
+    pub fn send(&self, message: Bytes) -> bool {
+        self.outbound.try_send(Outbound { since: Instant::now(), subject: self.subject.clone(), message }).is_ok()
+    }
+}
+
+fn packets_of(prefix: &str, room: &RoomName) -> Subject {
+    format!("{prefix}.room.{room}").into()
 }
 
 /// The buckets that nodes share.
@@ -302,17 +322,18 @@ impl Cluster {
             .await
             .map_err(|error| problem(error.to_string()))?;
         let (outlet, outbound) = mpsc::channel(MOST_WAITING);
+        let prefix = format!("rhytid.{}", &character_sha256[..8.min(character_sha256.len())]);
         Ok(Arc::new(Self {
             node: node_id(),
             address,
             replicas: usize::from(config.replicas.unwrap_or(1)),
-            prefix: format!("rhytid.{}", &character_sha256[..8.min(character_sha256.len())]),
             client,
             connections,
             joined: watch::Sender::new((0, Instant::now())),
             started: Instant::now(),
             outbound: Mutex::new(Some(outbound)),
-            outlet: Outlet(outlet),
+            outlet: Outlet { prefix: prefix.clone(), outbound: outlet },
+            prefix,
             buckets: OnceLock::new(),
             held: Mutex::default(),
             entering: Mutex::default(),
@@ -388,8 +409,8 @@ impl Cluster {
         format!("{}.{rest}", self.prefix)
     }
 
-    fn packets_of(&self, room: &RoomName) -> String {
-        self.subject(&format!("room.{room}"))
+    fn packets_of(&self, room: &RoomName) -> Subject {
+        packets_of(&self.prefix, room)
     }
 
     /// Runs the node's part until the service ends.
@@ -399,7 +420,7 @@ impl Cluster {
             tasks.spawn(self.clone().send_packets(outbound));
         }
         tasks.spawn(self.clone().answer(rooms.clone()));
-        tasks.spawn(self.clone().hear_of_nodes());
+        tasks.spawn(self.clone().hear_of_nodes(rooms.clone()));
         tasks.spawn(self.clone().look_after(rooms.clone()));
         tasks.spawn(feed::run(self.clone(), rooms));
         // Not cut off in the middle of what it has taken.
@@ -412,13 +433,13 @@ impl Cluster {
     }
 
     async fn send_packets(self: Arc<Self>, mut outbound: mpsc::Receiver<Outbound>) {
-        while let Some(Outbound { since, room, message }) = outbound.recv().await {
+        while let Some(Outbound { since, subject, message }) = outbound.recv().await {
             // Without a connection it would only wait: by then it is old.
             if since.elapsed() < OLD
                 && self.client.connection_state() == State::Connected
-                && let Err(error) = self.client.publish(self.packets_of(&room), message).await
+                && let Err(error) = self.client.publish(subject.clone(), message).await
             {
-                tracing::debug!(%room, %error, "packet not sent to other nodes");
+                tracing::debug!(%subject, %error, "packet not sent to other nodes");
             }
         }
     }
@@ -462,7 +483,7 @@ impl Cluster {
         EnterAnswer { is_granted, slots: slots.into_iter().map(|(slot, _)| slot).collect() }
     }
 
-    async fn hear_of_nodes(self: Arc<Self>) {
+    async fn hear_of_nodes(self: Arc<Self>, rooms: Weak<Rooms>) {
         let Ok(mut listings) = self.client.subscribe(self.subject("listing")).await else { return };
         while let Some(message) = listings.next().await {
             let told = match serde_json::from_slice::<NodeListing>(&message.payload) {
@@ -477,6 +498,8 @@ impl Cluster {
                 self.is_cut.store(false, Ordering::SeqCst);
                 continue;
             }
+            let Some(rooms) = rooms.upgrade() else { return };
+            rooms.want(told.is_partial, told.rooms.iter().filter(|room| room.viewers > 0).map(|room| room.name.as_str()));
             let mut nodes = lock(&self.nodes);
             if nodes.len() >= MOST_NODES && !nodes.contains_key(&told.node) {
                 continue;
@@ -557,11 +580,12 @@ impl Cluster {
     /// Tells other nodes of this one's rooms.
     async fn tell(&self, rooms: &Rooms) {
         let mut listed = rooms.list();
+        let is_partial = listed.len() > MOST_LISTED;
         listed.truncate(MOST_LISTED);
         let of = listed.len().div_ceil(LISTED_AT_ONCE).max(1);
         for part in 0..of {
             let rooms = listed.drain(..listed.len().min(LISTED_AT_ONCE)).collect();
-            let told = NodeListing { node: self.node.clone(), address: self.address.clone(), part, of, rooms };
+            let told = NodeListing { node: self.node.clone(), address: self.address.clone(), part, of, is_partial, rooms };
             let text = serde_json::to_vec(&told).expect("plain data can be written");
             if let Err(error) = self.client.publish(self.subject("listing"), text.into()).await {
                 tracing::debug!(%error, "listing not sent");

@@ -4,7 +4,7 @@ mod listing;
 mod nodes;
 mod recorded;
 
-use crate::cluster::{Kept, Outlet, StateHead};
+use crate::cluster::{Kept, RoomOutlet, StateHead};
 use crate::metrics::Metrics;
 use crate::recording::{Item, Recorder, SessionEvent, Sink};
 use crate::solve::mix::Mixer;
@@ -130,7 +130,7 @@ pub(crate) struct Room {
     since: Instant,
     layout: PacketLayout,
     metrics: Arc<Metrics>,
-    outlet: Option<Outlet>,
+    outlet: Option<RoomOutlet>,
     interest: Option<watch::Sender<()>>,
 }
 
@@ -160,6 +160,8 @@ struct RoomState {
     epoch: u64,
     /// NATS has recorded that epoch: packets under one that it has not would shut out those of the true home.
     is_shared: bool,
+    /// Until then on the room's clock, ns, other nodes get its packets: somebody watches there, or may.
+    wanted_until: u64,
     /// States that came before this node was the room's home: they are of another epoch.
     num_states_before: u64,
     /// What came from another node.
@@ -306,12 +308,13 @@ impl Rooms {
                 is_home: self.others.is_none(),
                 epoch: 0,
                 is_shared: false,
+                wanted_until: 0,
                 num_states_before: 0,
                 fed: None,
             }),
             layout,
             metrics: self.metrics.clone(),
-            outlet: self.others.as_ref().map(|others| others.outlet.clone()),
+            outlet: self.others.as_ref().map(|others| others.outlet.of(name)),
             interest: self.others.as_ref().map(|others| others.interest.clone()),
         });
         by_name.insert(name.clone(), room.clone());
@@ -432,7 +435,19 @@ impl Publishing {
         let kind = state.encoder.encode(merged, &mut state.packet);
         state.num_states += 1;
         let index = state.num_states;
-        let bytes = Bytes::copy_from_slice(&state.packet);
+        let key_index = state.key.as_ref().filter(|_| kind == PacketKind::Delta).map_or(index, |key| key.index);
+        let outlet = self.room.outlet.as_ref().filter(|_| state.is_shared && nanos < state.wanted_until);
+        let bytes = match outlet {
+            // Written once, for other nodes and for the viewers here.
+            Some(outlet) => {
+                let message = StateHead { epoch: state.epoch, index, key_index }.message(&state.packet);
+                if !outlet.send(message.clone()) {
+                    self.room.metrics.drop_frames("slow_cluster", 1);
+                }
+                message.slice(StateHead::LENGTH..)
+            }
+            None => Bytes::copy_from_slice(&state.packet),
+        };
         if let Some(sink) = &state.recording {
             sink.put(nanos, Item::Packet(bytes.clone()));
         }
@@ -442,12 +457,6 @@ impl Publishing {
         };
         state.key = Some(key.clone());
         state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
-        if let Some(outlet) = self.room.outlet.as_ref().filter(|_| state.is_shared) {
-            let head = StateHead { epoch: state.epoch, index, key_index: key.index };
-            if !outlet.send(&self.room.name, head, &state.packet) {
-                self.room.metrics.drop_frames("slow_cluster", 1);
-            }
-        }
         // Under the lock, so that states stand in the slot in their order.
         self.room.slot.send_replace(Some(Arc::new(Latest { index, key, delta, json: OnceLock::new() })));
         true

@@ -13,6 +13,8 @@ use tokio_tungstenite::tungstenite::Bytes;
 
 /// How often rooms are looked through, whatever is heard of them.
 const ROUND: Duration = Duration::from_secs(1);
+/// A room of which nothing comes is asked for this often.
+const QUIET: Duration = Duration::from_secs(1);
 /// A key packet is asked for at most this often.
 const ASK_SPACING: Duration = Duration::from_millis(100);
 
@@ -46,12 +48,21 @@ async fn feed(cluster: Arc<Cluster>, room: Arc<Room>) {
     homes.mark_changed();
     let mut asked = (None, 0);
     let mut asked_at: Option<Instant> = None;
+    let mut quiet_at = tokio::time::Instant::now() + QUIET;
     loop {
         let needs_key = tokio::select! {
             message = packets.next() => match message {
-                Some(message) => take(&room, &message.payload) == Fed::NeedsKey,
+                Some(message) => {
+                    quiet_at = tokio::time::Instant::now() + QUIET;
+                    take(&room, &message.payload) == Fed::NeedsKey
+                }
                 None => return,
             },
+            // Nothing is published, or the home does not know that somebody watches here, or what came last was lost.
+            () = tokio::time::sleep_until(quiet_at) => {
+                quiet_at = tokio::time::Instant::now() + QUIET;
+                true
+            }
             changed = homes.changed() => {
                 if changed.is_err() {
                     return;
@@ -113,7 +124,7 @@ mod tests {
     fn node_that_tells(interest: watch::Sender<()>) -> (Arc<Rooms>, mpsc::Receiver<Outbound>, PacketLayout) {
         let character = Arc::new(Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap());
         let (outlet, outbound) = mpsc::channel(64);
-        let others = Others { outlet: Outlet(outlet), interest };
+        let others = Others { outlet: Outlet { prefix: String::new(), outbound: outlet }, interest };
         let layout = PacketLayout::from(&*character);
         let metrics = Arc::new(Metrics::new());
         let recorder = Recorder::new(RecordConfig::default(), &character, metrics.clone(), mpsc::channel(1).0);

@@ -18,7 +18,7 @@ pub(crate) struct StateHead {
 
 impl StateHead {
     /// Bytes before the packet.
-    const LENGTH: usize = 24;
+    pub const LENGTH: usize = 24;
 
     /// The message of a packet: three u64, little endian, and the packet as viewers get it.
     pub fn message(self, packet: &[u8]) -> Bytes {
@@ -118,6 +118,9 @@ pub(crate) struct NodeListing {
     /// Which part of its list this is, from 0, and of how many.
     pub part: usize,
     pub of: usize,
+    /// It has more rooms than its list: any of them may be watched there.
+    #[serde(default)]
+    pub is_partial: bool,
     /// Its rooms, at most [`LISTED_AT_ONCE`].
     pub rooms: Vec<RoomListing>,
 }

@@ -12,7 +12,7 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RoomListing {
     pub name: String,
-    viewers: usize,
+    pub viewers: usize,
     /// Publishers the room has had.
     session: u32,
     /// The one of the highest priority.

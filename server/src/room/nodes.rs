@@ -6,9 +6,12 @@ use rhytid_shared::packet::{Decoder, PacketKind};
 use rhytid_shared::{FaceFrame, RoomName};
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio_tungstenite::tungstenite::Bytes;
+
+/// Packets go to other nodes for so long after one of them has told that it watches, which each does twice a second.
+const WANTED_FOR: Duration = Duration::from_secs(3);
 
 /// What rooms need of other nodes.
 pub(crate) struct Others {
@@ -82,7 +85,10 @@ impl Rooms {
     /// A room's newest state as messages for another node: the key packet, and the delta where there is one.
     pub fn newest(&self, name: &RoomName) -> Vec<Bytes> {
         let Some(room) = self.find(name) else { return Vec::new() };
-        let state = lock(&room.state);
+        let mut guard = lock(&room.state);
+        let state = &mut *guard;
+        // Who asks watches, and gets from here on whatever comes.
+        room.want(state);
         let is_own = |latest: &Arc<Latest>| state.is_home && latest.key.index > state.num_states_before;
         let Some(latest) = room.slot.borrow().clone().filter(is_own) else { return Vec::new() };
         let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
@@ -102,6 +108,8 @@ impl Rooms {
             state.num_states_before = state.num_states;
         }
         (state.epoch, state.is_shared) = (epoch, is_shared);
+        // It is not known yet who watches.
+        room.want(&mut state);
         state.num_sessions = state.num_sessions.max(sessions);
         Ok(())
     }
@@ -112,6 +120,21 @@ impl Rooms {
         let mut state = lock(&room.state);
         if !state.is_home && state.epoch > epoch {
             state.follow(epoch);
+        }
+    }
+
+    /// Another node watches the rooms of these names, or may watch `all`, where it could not name each.
+    pub fn want<'a>(&self, all: bool, names: impl Iterator<Item = &'a str>) {
+        let rooms: Vec<Arc<Room>> = {
+            let by_name = lock(&self.by_name);
+            if all {
+                by_name.values().cloned().collect()
+            } else {
+                names.filter_map(|name| by_name.get(&RoomName::new(name).ok()?).cloned()).collect()
+            }
+        };
+        for room in rooms {
+            room.want(&mut lock(&room.state));
         }
     }
 
@@ -163,6 +186,11 @@ impl RoomState {
 }
 
 impl Room {
+    /// Somebody watches at another node, or may.
+    fn want(&self, state: &mut RoomState) {
+        state.wanted_until = self.nanos().saturating_add(WANTED_FOR.as_nanos() as u64);
+    }
+
     /// Takes a packet that came from the room's home at another node.
     pub fn feed(&self, head: StateHead, packet: Bytes) -> Fed {
         let mut guard = lock(&self.state);

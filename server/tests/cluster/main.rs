@@ -52,6 +52,7 @@ mod linux {
             trial("viewers_at_all_nodes_get_the_same_packets", rooms::viewers_at_all_nodes_get_the_same_packets),
             trial("late_viewer_elsewhere_gets_the_newest_face_at_once", rooms::late_viewer_elsewhere_gets_the_newest_face_at_once),
             trial("room_has_one_publisher_in_the_whole_cluster", rooms::room_has_one_publisher_in_the_whole_cluster),
+            trial("frames_that_nobody_watches_elsewhere_stay_at_home", rooms::unwatched_elsewhere),
             trial("hello_that_leads_to_nothing_takes_no_room_from_anybody", rooms::hello_that_leads_to_nothing),
             trial("face_is_back_with_its_neutral_when_its_node_is_killed", outages::face_is_back_with_its_neutral_when_its_node_is_killed),
             trial("face_is_back_when_its_node_is_stopped_and_nothing_old_comes_when_it_goes_on", outages::stopped_node),

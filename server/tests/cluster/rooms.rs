@@ -1,12 +1,14 @@
 //! One room before all nodes: who sees it, and who publishes to it.
 
+use super::http;
 use super::nats::{Nats, free_port};
 use super::nodes::{Cluster, HELLO, Node, RawViewer};
 use super::process::wait_for;
 use super::senders::{fake, write_feed};
 use super::watch::Watch;
 use rhytid_shared::packet::{Decoder, PacketLayout};
-use serde_json::json;
+use serde_json::{Value, json};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 pub fn viewers_at_all_nodes_get_the_same_packets() {
@@ -82,6 +84,59 @@ pub fn room_has_one_publisher_in_the_whole_cluster() {
     second.socket.close(None).unwrap();
     while second.socket.read().is_ok() {}
     a.publisher("demo", HELLO).ready();
+}
+
+pub fn unwatched_elsewhere() {
+    let monitor = free_port().to_string();
+    let nats = Nats::with(&["-m", &monitor]);
+    let [a, b] = [0, 1].map(|_| Node::start(&nats.url()).ready());
+    let num_messages = || {
+        let (_, body) = http::ask(&format!("127.0.0.1:{monitor}"), "GET", "/varz", &[], "").unwrap();
+        serde_json::from_str::<Value>(&body).unwrap()["in_msgs"].as_u64().unwrap()
+    };
+    let mut publisher = a.publisher("demo", HELLO).ready();
+    let (num_frames, is_over) = (AtomicU64::new(0), AtomicBool::new(false));
+    // Messages to NATS, and frames, while the publisher sends so many more.
+    let sent_with = |num_more: u64| {
+        let before = (num_messages(), num_frames.load(Ordering::SeqCst));
+        wait_for("the frames", || (num_frames.load(Ordering::SeqCst) >= before.1 + num_more).then_some(()));
+        let frames = num_frames.load(Ordering::SeqCst) - before.1;
+        (num_messages() - before.0, frames)
+    };
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !is_over.load(Ordering::SeqCst) {
+                publisher.frame(0.5);
+                num_frames.fetch_add(1, Ordering::SeqCst);
+                std::thread::sleep(Duration::from_millis(16));
+            }
+        });
+        let _over = Over(&is_over);
+        // A fresh home does not know yet who watches.
+        std::thread::sleep(Duration::from_secs(4));
+        let (num_sent, num_frames) = sent_with(120);
+        assert!(num_sent < num_frames / 2, "{num_sent} messages for {num_frames} frames that nobody watches elsewhere");
+        let watch = Watch::start(&[&b.address], "demo");
+        watch.wait_for_more("the face elsewhere");
+        let start = Instant::now();
+        // Longer than what one question is good for.
+        while start.elapsed() < Duration::from_secs(5) {
+            let (num_sent, num_frames) = sent_with(60);
+            // One may be on its way.
+            assert!(num_sent + 3 >= num_frames, "{num_sent} messages for {num_frames} frames, after {:?}", start.elapsed());
+            watch.wait_for_more("the face elsewhere");
+        }
+        watch.finish();
+    });
+}
+
+/// Ends a thread, also where the test fails.
+struct Over<'a>(&'a AtomicBool);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::SeqCst);
+    }
 }
 
 pub fn hello_that_leads_to_nothing() {
