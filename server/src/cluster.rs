@@ -499,7 +499,7 @@ impl Cluster {
                 continue;
             }
             let Some(rooms) = rooms.upgrade() else { return };
-            rooms.want(told.is_partial, told.rooms.iter().filter(|room| room.viewers > 0).map(|room| room.name.as_str()));
+            rooms.want(told.is_partial, told.rooms.iter().filter(|room| room.is_wanted()).map(|room| room.name.as_str()));
             let mut nodes = lock(&self.nodes);
             if nodes.len() >= MOST_NODES && !nodes.contains_key(&told.node) {
                 continue;

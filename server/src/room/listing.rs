@@ -12,7 +12,7 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RoomListing {
     pub name: String,
-    pub viewers: usize,
+    viewers: usize,
     /// Publishers the room has had.
     session: u32,
     /// The one of the highest priority.
@@ -23,6 +23,13 @@ pub(crate) struct RoomListing {
     neutral: Option<NeutralListing>,
     /// The recording being made of it, or the last one where that has failed.
     recording: Option<RecorderStatus>,
+}
+
+impl RoomListing {
+    /// Its packets are wanted where it is listed: somebody watches, or they are recorded.
+    pub fn is_wanted(&self) -> bool {
+        self.viewers > 0 || self.recording.is_some()
+    }
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
