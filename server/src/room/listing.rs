@@ -25,13 +25,6 @@ pub(crate) struct RoomListing {
     recording: Option<RecorderStatus>,
 }
 
-impl RoomListing {
-    /// Its packets are wanted where it is listed: somebody watches, or they are recorded.
-    pub fn is_wanted(&self) -> bool {
-        self.viewers > 0 || self.recording.is_some()
-    }
-}
-
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct PublisherListing {
     source: String,
