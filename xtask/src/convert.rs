@@ -56,6 +56,11 @@ pub fn run(conversion: &Conversion) -> Result<()> {
     for scale in [Some(conversion.from_scale), conversion.scale].into_iter().flatten() {
         ensure!(scale > 0.0 && scale <= forms::MAX_SCALE, "a scale is {scale}, expected more than 0 and at most {}", forms::MAX_SCALE);
     }
+    // Of what is read it would say nothing, and the picture would be wrong.
+    ensure!(
+        conversion.scale.is_none() || conversion.to == Form::Derivatives,
+        "--scale is for derivatives that are written; the scale of those that are read is --from-scale"
+    );
     let (picture, side) = read(&conversion.input)?;
     let base = match &conversion.base {
         Some(path) => {
@@ -181,6 +186,11 @@ mod tests {
         a.iter().zip(&b).map(|(a, b)| forms::angle(forms::normal_of(*a), forms::normal_of(*b))).fold(0.0, f32::max)
     }
 
+    /// Only derivatives have one.
+    fn scale_of(form: Form, scale: f32) -> Option<f32> {
+        (form == Form::Derivatives).then_some(scale)
+    }
+
     #[test]
     fn normals_come_back_from_either_form_with_any_base() {
         let folder = Folder::new("round");
@@ -188,8 +198,11 @@ mod tests {
         waves(&folder.0.join("base.png"), 64, 0.2);
         for base in [None, Some(folder.0.join("base.png"))] {
             for form in [Form::Derivatives, Form::Differences] {
-                let there =
-                    Conversion { base: base.clone(), scale: Some(0.9), ..conversion(&folder, "in.png", "form.png", Form::Normals, form) };
+                let there = Conversion {
+                    base: base.clone(),
+                    scale: scale_of(form, 0.9),
+                    ..conversion(&folder, "in.png", "form.png", Form::Normals, form)
+                };
                 run(&there).expect("converted");
                 let back =
                     Conversion { base: base.clone(), from_scale: 0.9, ..conversion(&folder, "form.png", "out.png", form, Form::Normals) };
@@ -214,7 +227,8 @@ mod tests {
         let folder = Folder::new("flat");
         RgbImage::from_pixel(4, 4, Rgb([128, 128, 255])).save(folder.0.join("in.png")).expect("written");
         for (to, want) in [(Form::Derivatives, [128, 128, 255]), (Form::Differences, [128, 128, 128]), (Form::Normals, [128, 128, 255])] {
-            run(&Conversion { scale: Some(0.3), ..conversion(&folder, "in.png", "out.png", Form::Normals, to) }).expect("converted");
+            run(&Conversion { scale: scale_of(to, 0.3), ..conversion(&folder, "in.png", "out.png", Form::Normals, to) })
+                .expect("converted");
             let out = image::open(folder.0.join("out.png")).expect("read").to_rgb8();
             assert!(out.pixels().all(|pixel| pixel.0 == want), "{to:?}");
         }
@@ -254,6 +268,7 @@ mod tests {
         says(plain("gray.png"), "is gray");
         says(Conversion { base: Some(folder.0.join("base.png")), ..plain("in.png") }, "expected (8, 8) as the input");
         says(Conversion { scale: Some(0.0), ..plain("in.png") }, "a scale is 0");
+        says(Conversion { scale: Some(0.6), to: Form::Normals, ..plain("in.png") }, "is --from-scale");
         says(Conversion { size: Some(3), ..plain("in.png") }, "--size 3 does not divide 8 x 8");
     }
 }
