@@ -2,9 +2,10 @@
 //! speed. Every jump begins a new session, because a session's time does not go back.
 
 use super::faces::{Faces, Moment};
+use super::files::room_of_file;
 use super::format::SessionEvent;
 use super::reader::{ReadError, Recording};
-use super::writer::{Item, room_of_file};
+use super::recorder::Item;
 use crate::config::seconds;
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;

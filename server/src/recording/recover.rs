@@ -1,8 +1,9 @@
 //! Mending a recording that was not finished, or was damaged: what is whole is written anew, with its index.
 
+use super::files::hold;
 use super::format::{SessionEvent, Topic};
 use super::reader::{ReadError, Recording};
-use super::writer::{RecordingWriter, hold};
+use super::writer::RecordingWriter;
 use mcap::McapError;
 use rhytid_shared::packet::BatchReader;
 use std::fs::{File, OpenOptions};

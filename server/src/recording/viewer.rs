@@ -1,7 +1,9 @@
 //! Recording as a viewer: the packets of a room on any server, without what its publisher sent.
 
+use super::files::hold;
 use super::format::{SessionEvent, VERSION};
-use super::writer::{RecordError, RecordingWriter, hold, nanos, unix_nanos};
+use super::recorder::RecordError;
+use super::writer::{RecordingWriter, nanos, unix_nanos};
 use crate::send::{SendError, connect};
 use futures_util::StreamExt;
 use mcap::McapError;
