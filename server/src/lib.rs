@@ -12,6 +12,7 @@ mod config;
 mod control;
 pub mod feed;
 mod fit;
+mod framed;
 #[doc(hidden)]
 pub mod fuzz;
 mod http;

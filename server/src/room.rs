@@ -5,6 +5,7 @@ mod nodes;
 mod recorded;
 
 use crate::cluster::{Kept, RoomOutlet, StateHead};
+use crate::framed::FramedPacket;
 use crate::metrics::Metrics;
 use crate::recording::{Item, Recorder, SessionEvent, Sink};
 use crate::solve::mix::Mixer;
@@ -16,7 +17,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
-use tokio_tungstenite::tungstenite::{Bytes, Utf8Bytes};
+use tokio_tungstenite::tungstenite::Utf8Bytes;
 
 pub(crate) use listing::{RoomListing, merge};
 pub(crate) use nodes::{Fed, Others};
@@ -30,14 +31,14 @@ pub(crate) struct Latest {
     /// The key packet that decodes by itself.
     pub key: Arc<KeyPacket>,
     /// The newest packet where it is not the key packet.
-    pub delta: Option<Bytes>,
+    pub delta: Option<FramedPacket>,
     json: OnceLock<Utf8Bytes>,
 }
 
 /// A key packet with the index of its state.
 pub(crate) struct KeyPacket {
     pub index: u64,
-    pub bytes: Bytes,
+    pub framed: FramedPacket,
 }
 
 impl Latest {
@@ -45,8 +46,8 @@ impl Latest {
     pub fn json(&self, layout: &PacketLayout, character: &CharacterHello) -> Utf8Bytes {
         let make = || {
             let (mut decoder, mut frame) = (Decoder::new(layout.clone()), layout.frame_at_rest());
-            for packet in [Some(&self.key.bytes), self.delta.as_ref()].into_iter().flatten() {
-                decoder.decode(packet, &mut frame).expect("it comes from the room's own encoder, or was read when it came");
+            for framed in [Some(&self.key.framed), self.delta.as_ref()].into_iter().flatten() {
+                decoder.decode(framed.packet(), &mut frame).expect("it comes from the room's own encoder, or was read when it came");
             }
             let message = ViewMessage::Frame(JsonFrame::new(&frame, character));
             serde_json::to_string(&message).expect("plain data can be written").into()
@@ -148,6 +149,8 @@ struct RoomState {
     /// Sessions so far: publishers, and hand-overs of the lead between them.
     num_sessions: u32,
     num_viewers: usize,
+    /// Viewers so far.
+    num_joins: u64,
     num_states: u64,
     key: Option<Arc<KeyPacket>>,
     /// What the listing shows of the newest frame.
@@ -217,13 +220,14 @@ impl Rooms {
             return Err(RoomError::TooManyViewers { most: self.max_viewers });
         }
         state.num_viewers += 1;
-        let is_first = state.num_viewers == 1;
+        state.num_joins += 1;
+        let (number, is_first) = (state.num_joins, state.num_viewers == 1);
         drop(state);
         self.metrics.viewers.inc();
         if let Some(interest) = room.interest.as_ref().filter(|_| is_first) {
             interest.send_replace(());
         }
-        Ok(Viewing { slot: room.slot.subscribe(), room })
+        Ok(Viewing { slot: room.slot.subscribe(), room, number })
     }
 
     /// Enters a room as a source, in place of the one in its slot where the claim says so. What comes with the place says when
@@ -306,6 +310,7 @@ impl Rooms {
                 encoded_session: 0,
                 num_sessions: 0,
                 num_viewers: 0,
+                num_joins: 0,
                 num_states: 0,
                 key: None,
                 shown: None,
@@ -394,6 +399,8 @@ pub(crate) fn mixer_time(nanos: u64) -> f64 {
 /// A viewer's place in a room; given back on drop.
 pub(crate) struct Viewing {
     pub room: Arc<Room>,
+    /// Counts those that have joined the room.
+    pub number: u64,
     /// The newest state.
     pub slot: watch::Receiver<Option<Arc<Latest>>>,
 }
@@ -445,24 +452,18 @@ impl Publishing {
         state.num_states += 1;
         let index = state.num_states;
         let key_index = state.key.as_ref().filter(|_| kind == PacketKind::Delta).map_or(index, |key| key.index);
-        let outlet = self.room.outlet.as_ref().filter(|_| state.is_shared && nanos < state.wanted_until);
-        let bytes = match outlet {
-            // Written once, for other nodes and for the viewers here.
-            Some(outlet) => {
-                let message = StateHead { epoch: state.epoch, index, key_index }.message(&state.packet);
-                if !outlet.send(message.clone()) {
-                    self.room.metrics.drop_frames("slow_cluster", 1);
-                }
-                message.slice(StateHead::LENGTH..)
-            }
-            None => Bytes::copy_from_slice(&state.packet),
-        };
+        if let Some(outlet) = self.room.outlet.as_ref().filter(|_| state.is_shared && nanos < state.wanted_until)
+            && !outlet.send(StateHead { epoch: state.epoch, index, key_index }.message(&state.packet))
+        {
+            self.room.metrics.drop_frames("slow_cluster", 1);
+        }
+        let framed = FramedPacket::new(&state.packet);
         if let Some(sink) = &state.recording {
-            sink.put(nanos, Item::Packet(bytes.clone()));
+            sink.put(nanos, Item::Packet(framed.to_packet()));
         }
         let (key, delta) = match (kind, &state.key) {
-            (PacketKind::Delta, Some(key)) => (key.clone(), Some(bytes)),
-            _ => (Arc::new(KeyPacket { index, bytes }), None),
+            (PacketKind::Delta, Some(key)) => (key.clone(), Some(framed)),
+            _ => (Arc::new(KeyPacket { index, framed }), None),
         };
         state.key = Some(key.clone());
         state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
@@ -594,7 +595,7 @@ mod tests {
             pipeline.frame(&frame, &mut packet).unwrap();
             assert!(place.publish(pipeline.face(), None));
             let latest = place.room.slot.borrow().clone().unwrap();
-            assert_eq!(latest.delta.as_ref().unwrap_or(&latest.key.bytes)[..], packet[..]);
+            assert_eq!(latest.delta.as_ref().unwrap_or(&latest.key.framed).packet(), packet);
         }
     }
 

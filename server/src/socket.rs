@@ -192,25 +192,6 @@ pub(crate) fn tokens<'a>(headers: &'a HeaderMap, name: &header::HeaderName) -> i
         .filter(|word| !word.is_empty())
 }
 
-/// The bytes of one whole frame from a server: `opcode` with FIN, no mask (RFC 6455, 5.2).
-pub(crate) fn frame_bytes(opcode: u8, payload: &[u8]) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(payload.len() + 10);
-    bytes.push(0x80 | opcode);
-    match payload.len() {
-        len @ 0..=125 => bytes.push(len as u8),
-        len @ 126..=0xFFFF => {
-            bytes.push(126);
-            bytes.extend((len as u16).to_be_bytes());
-        }
-        len => {
-            bytes.push(127);
-            bytes.extend((len as u64).to_be_bytes());
-        }
-    }
-    bytes.extend(payload);
-    bytes
-}
-
 /// Sends one message within `timeout`.
 pub(crate) async fn send(socket: &mut Socket, message: Message, timeout: Duration) -> Result<(), Stop> {
     match tokio::time::timeout(timeout, socket.send(message)).await {

@@ -130,17 +130,18 @@ pub(super) fn put_packet_head(seq: usize, out: &mut Vec<u8>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::socket::frame_bytes;
+    use crate::framed::put_server_frame;
 
     #[test]
     fn frames_are_found_however_the_stream_is_cut() {
         let mut packet = Vec::new();
         put_packet_head(300, &mut packet);
         packet.extend([9; 90]);
-        let mut stream = frame_bytes(TEXT, &[b'x'; 70_000]);
-        stream.extend(frame_bytes(PING, b"hi"));
+        let mut stream = Vec::new();
+        put_server_frame(TEXT, &[b'x'; 70_000], &mut stream);
+        put_server_frame(PING, b"hi", &mut stream);
         for _ in 0..3 {
-            stream.extend(frame_bytes(BINARY, &packet));
+            put_server_frame(BINARY, &packet, &mut stream);
         }
         for step in [1, 2, 3, 7, 100, 5000, 100_000] {
             let mut reader = FrameReader::default();

@@ -2,6 +2,7 @@
 
 use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomError, RoomState, Rooms, lock};
 use crate::cluster::{Kept, Outlet, StateHead};
+use crate::framed::FramedPacket;
 use rhytid_shared::packet::{Decoder, PacketKind};
 use rhytid_shared::{FaceFrame, RoomName};
 use std::collections::HashMap;
@@ -92,9 +93,9 @@ impl Rooms {
         let is_own = |latest: &Arc<Latest>| state.is_home && latest.key.index > state.num_states_before;
         let Some(latest) = room.slot.borrow().clone().filter(is_own) else { return Vec::new() };
         let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
-        let key = head(latest.key.index).message(&latest.key.bytes);
+        let key = head(latest.key.index).message(latest.key.framed.packet());
         latest.delta.iter().fold(vec![key], |mut messages, delta| {
-            messages.push(head(latest.index).message(delta));
+            messages.push(head(latest.index).message(delta.packet()));
             messages
         })
     }
@@ -217,6 +218,7 @@ impl Room {
             Ok(kind) => (kind == PacketKind::Key) == is_key,
             Err(_) => false,
         };
+        let framed = FramedPacket::new(&packet);
         let (delta, key_packet) = match (&state.key, is_key) {
             _ if !is_sound => {
                 // Its decoder may hold another key packet than is noted.
@@ -224,19 +226,19 @@ impl Room {
                 self.metrics.drop_frames("bad_cluster_packet", 1);
                 return Fed::Broken;
             }
-            (_, true) => (None, Arc::new(KeyPacket { index: state.num_states + 1, bytes: packet })),
-            (Some(key), false) => (Some(packet), key.clone()),
+            (_, true) => (None, Arc::new(KeyPacket { index: state.num_states + 1, framed })),
+            (Some(key), false) => (Some(framed), key.clone()),
             (None, false) => return Fed::NeedsKey,
         };
         (fed.head, fed.key) = (head, key);
-        let recorded = (fed.frame.session, delta.as_ref().unwrap_or(&key_packet.bytes).clone());
+        let session = fed.frame.session;
         state.shown = Some((fed.frame.seq, fed.frame.captured_at_micros, fed.frame.face));
-        state.num_sessions = state.num_sessions.max(fed.frame.session);
+        state.num_sessions = state.num_sessions.max(session);
         state.epoch = head.epoch;
         state.key = Some(key_packet.clone());
         state.num_states += 1;
         self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key: key_packet, delta, json: OnceLock::new() })));
-        self.record_fed(state, recorded.0, &recorded.1);
+        self.record_fed(state, session, packet);
         Fed::Taken
     }
 }

@@ -97,14 +97,14 @@ impl Room {
             sink.put(self.nanos(), under_way(session, Slot::MAIN, ELSEWHERE));
         }
         if let Some(key) = state.key.as_ref().filter(|_| !state.publishers.is_empty() || fed.is_some()) {
-            sink.put(self.nanos(), Item::Packet(key.bytes.clone()));
+            sink.put(self.nanos(), Item::Packet(key.framed.to_packet()));
         }
         state.fed_session = fed.map(|session| (session, 0));
         state.recording = Some(sink);
     }
 
     /// Records a packet of `session` that came from the room's home at another node, where the room is recorded.
-    pub(super) fn record_fed(&self, state: &mut RoomState, session: u32, packet: &Bytes) {
+    pub(super) fn record_fed(&self, state: &mut RoomState, session: u32, packet: Bytes) {
         if !state.is_recorded() {
             return;
         }
@@ -113,7 +113,7 @@ impl Room {
             self.end_fed(state);
             self.record(state, || under_way(session, Slot::MAIN, ELSEWHERE));
         }
-        self.record(state, || Item::Packet(packet.clone()));
+        self.record(state, || Item::Packet(packet));
         state.fed_session = Some((session, before.map_or(0, |(_, frames)| frames) + 1));
         // A room of which something is recorded stays, though nobody watches it here.
         state.empty_since = Instant::now();
