@@ -9,48 +9,74 @@ const PING: u8 = 9;
 
 /// A ping without payload.
 const PING_FRAME: [u8; 2] = [0x80 | PING, 0];
+/// Bytes of a frame's head, at most.
+const MOST_HEAD: usize = 10;
 
-/// A packet as a viewer gets it: its frame, and before it the ping for those whose turn it is to be asked.
+/// A message as a viewer gets it: its frame, and before it the ping for those whose turn it is to be asked.
 #[derive(Clone)]
-pub(crate) struct FramedPacket {
+pub(crate) struct Framed {
     bytes: Bytes,
-    /// Bytes before the packet.
+    /// Bytes before the payload.
     head_len: usize,
 }
 
-impl FramedPacket {
-    pub fn new(packet: &[u8]) -> Self {
-        let mut bytes = Vec::with_capacity(PING_FRAME.len() + MOST_HEAD + packet.len());
-        bytes.extend(PING_FRAME);
-        put_server_frame(BINARY, packet, &mut bytes);
-        Self { head_len: bytes.len() - packet.len(), bytes: bytes.into() }
+impl Framed {
+    /// A packet.
+    pub fn packet(packet: &[u8]) -> Self {
+        Self::new(BINARY, packet)
     }
 
-    /// The packet itself.
-    pub fn packet(&self) -> &[u8] {
+    /// A text message.
+    pub fn text(text: &str) -> Self {
+        Self::new(TEXT, text.as_bytes())
+    }
+
+    fn new(opcode: u8, payload: &[u8]) -> Self {
+        let mut bytes = Vec::with_capacity(PING_FRAME.len() + MOST_HEAD + payload.len());
+        bytes.extend(PING_FRAME);
+        put_server_frame(opcode, payload, &mut bytes);
+        Self { head_len: bytes.len() - payload.len(), bytes: bytes.into() }
+    }
+
+    /// What is framed.
+    pub fn payload(&self) -> &[u8] {
         &self.bytes[self.head_len..]
     }
 
-    /// As [`Self::packet`], to be kept.
-    pub fn to_packet(&self) -> Bytes {
+    /// As [`Self::payload`], to be kept.
+    pub fn to_payload(&self) -> Bytes {
         self.bytes.slice(self.head_len..)
     }
 
     /// What goes to a viewer.
     pub fn frames(&self, with_ping: bool) -> &[u8] {
-        &self.bytes[if with_ping { 0 } else { PING_FRAME.len() }..]
+        &self.bytes[Self::start(with_ping)..]
     }
+
+    /// As [`Self::frames`], to be kept.
+    pub fn to_frames(&self, with_ping: bool) -> Bytes {
+        self.bytes.slice(Self::start(with_ping)..)
+    }
+
+    /// This and `next` behind it, to be kept.
+    pub fn to_frames_before(&self, next: &Self, with_ping: bool) -> Bytes {
+        [self.frames(with_ping), next.frames(false)].concat().into()
+    }
+
+    fn start(with_ping: bool) -> usize {
+        if with_ping { 0 } else { PING_FRAME.len() }
+    }
+}
+
+/// A ping.
+pub(crate) fn ping() -> Bytes {
+    Bytes::from_static(&PING_FRAME)
 }
 
 /// A ping, and behind it a text message.
 pub(crate) fn ping_and_text(text: &str) -> Vec<u8> {
-    let mut bytes = PING_FRAME.to_vec();
-    put_server_frame(TEXT, text.as_bytes(), &mut bytes);
-    bytes
+    Framed::text(text).bytes.into()
 }
-
-/// Bytes of a frame's head, at most.
-const MOST_HEAD: usize = 10;
 
 /// Puts one whole frame from a server behind `bytes`: `opcode` with FIN, no mask (RFC 6455, 5.2).
 pub(crate) fn put_server_frame(opcode: u8, payload: &[u8], bytes: &mut Vec<u8>) {
@@ -93,11 +119,14 @@ mod tests {
     fn packets_of_any_length_are_read_with_their_pings_and_without() {
         for len in [0, 1, 125, 126, 127, 65_535, 65_536, 70_000] {
             let packet: Vec<u8> = (0..len).map(|k| k as u8).collect();
-            let framed = FramedPacket::new(&packet);
-            assert_eq!((framed.packet(), &framed.to_packet()[..]), (&packet[..], &packet[..]));
+            let framed = Framed::packet(&packet);
+            assert_eq!((framed.payload(), &framed.to_payload()[..]), (&packet[..], &packet[..]));
             assert_eq!(read(framed.frames(false)), [Message::binary(packet.clone())]);
             assert_eq!(framed.frames(true)[..2], PING_FRAME);
             assert_eq!(&framed.frames(true)[2..], framed.frames(false));
+            assert_eq!((&framed.to_frames(true)[..], &framed.to_frames(false)[..]), (framed.frames(true), framed.frames(false)));
+            let two = framed.to_frames_before(&Framed::text("next"), false);
+            assert_eq!(read(&two), [Message::binary(packet.clone()), Message::text("next")]);
         }
         assert_eq!(read(&ping_and_text("hello")[2..]), [Message::text("hello")]);
     }

@@ -6,7 +6,8 @@ use crate::config::Access;
 use crate::service::{Hub, Peer, Place};
 use crate::socket::{Ending, ErrorMessage, Handshake, close, tokens, upgrade};
 use crate::token::{Claims, Refusal, Role, now_seconds};
-use crate::{control, page, publish, room, viewer};
+use crate::viewer::{self, Member};
+use crate::{control, page, publish, room};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{Path, Request, State};
@@ -352,10 +353,11 @@ async fn view_socket(State(hub): State<Arc<Hub>>, Path(room): Path<String>, requ
     tracing::debug!(%room, wants_json, peer = ?request.extensions().get::<Peer>(), "viewer connects");
     match hub.rooms.join(&room) {
         Ok(viewing) => {
-            let first = viewer::first_frames(&hub, &room);
-            let config = viewer::socket_config();
-            upgrade(&hub.clone(), request, handshake, config, first, move |socket| {
-                viewer::talk(hub, socket, viewing, wants_json, pass.expires)
+            let (first, config) = (viewer::first_frames(&hub, &room), viewer::socket_config());
+            let place = request.extensions().get::<Arc<Place>>().cloned();
+            upgrade(&hub.clone(), request, handshake, config, first, async move |socket| {
+                let room = viewing.room.clone();
+                room.audience.enter(&hub, Member::new(socket, viewing, wants_json, pass.expires, place));
             })
         }
         // A browser's page cannot read the answer to a handshake, so the refusal is a message.

@@ -5,11 +5,12 @@ mod nodes;
 mod recorded;
 
 use crate::cluster::{Kept, RoomOutlet, StateHead};
-use crate::framed::FramedPacket;
+use crate::framed::Framed;
 use crate::metrics::Metrics;
 use crate::recording::{Item, Recorder, SessionEvent, Sink};
 use crate::solve::mix::Mixer;
 use crate::source::Control;
+use crate::viewer::Audience;
 use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
 use rhytid_shared::{Character, FaceFrame, PublishHello, RoomName, Slot};
@@ -17,7 +18,6 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
-use tokio_tungstenite::tungstenite::Utf8Bytes;
 
 pub(crate) use listing::{RoomListing, merge};
 pub(crate) use nodes::{Fed, Others};
@@ -31,28 +31,28 @@ pub(crate) struct Latest {
     /// The key packet that decodes by itself.
     pub key: Arc<KeyPacket>,
     /// The newest packet where it is not the key packet.
-    pub delta: Option<FramedPacket>,
-    json: OnceLock<Utf8Bytes>,
+    pub delta: Option<Framed>,
+    json: OnceLock<Framed>,
 }
 
 /// A key packet with the index of its state.
 pub(crate) struct KeyPacket {
     pub index: u64,
-    pub framed: FramedPacket,
+    pub framed: Framed,
 }
 
 impl Latest {
     /// The frame as JSON text: made once, by the first viewer that wants it.
-    pub fn json(&self, layout: &PacketLayout, character: &CharacterHello) -> Utf8Bytes {
+    pub fn json(&self, layout: &PacketLayout, character: &CharacterHello) -> &Framed {
         let make = || {
             let (mut decoder, mut frame) = (Decoder::new(layout.clone()), layout.frame_at_rest());
             for framed in [Some(&self.key.framed), self.delta.as_ref()].into_iter().flatten() {
-                decoder.decode(framed.packet(), &mut frame).expect("it comes from the room's own encoder, or was read when it came");
+                decoder.decode(framed.payload(), &mut frame).expect("it comes from the room's own encoder, or was read when it came");
             }
             let message = ViewMessage::Frame(JsonFrame::new(&frame, character));
-            serde_json::to_string(&message).expect("plain data can be written").into()
+            Framed::text(&serde_json::to_string(&message).expect("plain data can be written"))
         };
-        self.json.get_or_init(make).clone()
+        self.json.get_or_init(make)
     }
 }
 
@@ -128,6 +128,7 @@ pub(crate) struct Rooms {
 /// One room.
 pub(crate) struct Room {
     pub name: RoomName,
+    pub audience: Audience,
     slot: watch::Sender<Option<Arc<Latest>>>,
     state: Mutex<RoomState>,
     /// The mixer's clock counts from here.
@@ -301,6 +302,7 @@ impl Rooms {
         let room = Arc::new(Room {
             since: Instant::now(),
             name: name.clone(),
+            audience: Audience::default(),
             slot: watch::Sender::new(None),
             state: Mutex::new(RoomState {
                 publishers: Vec::new(),
@@ -457,9 +459,9 @@ impl Publishing {
         {
             self.room.metrics.drop_frames("slow_cluster", 1);
         }
-        let framed = FramedPacket::new(&state.packet);
+        let framed = Framed::packet(&state.packet);
         if let Some(sink) = &state.recording {
-            sink.put(nanos, Item::Packet(framed.to_packet()));
+            sink.put(nanos, Item::Packet(framed.to_payload()));
         }
         let (key, delta) = match (kind, &state.key) {
             (PacketKind::Delta, Some(key)) => (key.clone(), Some(framed)),
@@ -595,7 +597,7 @@ mod tests {
             pipeline.frame(&frame, &mut packet).unwrap();
             assert!(place.publish(pipeline.face(), None));
             let latest = place.room.slot.borrow().clone().unwrap();
-            assert_eq!(latest.delta.as_ref().unwrap_or(&latest.key.framed).packet(), packet);
+            assert_eq!(latest.delta.as_ref().unwrap_or(&latest.key.framed).payload(), packet);
         }
     }
 

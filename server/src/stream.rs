@@ -19,6 +19,13 @@ pub(crate) enum Wire {
     Encrypted(Box<TlsStream<TcpStream>>),
 }
 
+impl Wire {
+    /// What has been written may still wait for a flush.
+    pub fn is_encrypted(&self) -> bool {
+        matches!(self, Self::Encrypted(_))
+    }
+}
+
 impl AsyncRead for Wire {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         match self.get_mut() {

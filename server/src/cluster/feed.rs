@@ -249,7 +249,8 @@ mod tests {
         assert_eq!(room.feed(head, packets[1].1.clone()), Fed::Broken);
         let character = Character::from_glb(rhytid_shared::DEFAULT_CHARACTER_GLB).unwrap();
         let latest = viewing.slot.borrow().clone().unwrap();
-        assert!(latest.json(&layout, &ViewHello::new("", &character, String::new()).character).contains("\"seq\":0"));
+        let text = latest.json(&layout, &ViewHello::new("", &character, String::new()).character).payload();
+        assert!(str::from_utf8(text).unwrap().contains("\"seq\":0"));
     }
 
     #[test]

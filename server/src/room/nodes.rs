@@ -2,7 +2,7 @@
 
 use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomError, RoomState, Rooms, lock};
 use crate::cluster::{Kept, Outlet, StateHead};
-use crate::framed::FramedPacket;
+use crate::framed::Framed;
 use rhytid_shared::packet::{Decoder, PacketKind};
 use rhytid_shared::{FaceFrame, RoomName};
 use std::collections::HashMap;
@@ -93,9 +93,9 @@ impl Rooms {
         let is_own = |latest: &Arc<Latest>| state.is_home && latest.key.index > state.num_states_before;
         let Some(latest) = room.slot.borrow().clone().filter(is_own) else { return Vec::new() };
         let head = |index| StateHead { epoch: state.epoch, index, key_index: latest.key.index };
-        let key = head(latest.key.index).message(latest.key.framed.packet());
+        let key = head(latest.key.index).message(latest.key.framed.payload());
         latest.delta.iter().fold(vec![key], |mut messages, delta| {
-            messages.push(head(latest.index).message(delta.packet()));
+            messages.push(head(latest.index).message(delta.payload()));
             messages
         })
     }
@@ -218,7 +218,7 @@ impl Room {
             Ok(kind) => (kind == PacketKind::Key) == is_key,
             Err(_) => false,
         };
-        let framed = FramedPacket::new(&packet);
+        let framed = Framed::packet(&packet);
         let (delta, key_packet) = match (&state.key, is_key) {
             _ if !is_sound => {
                 // Its decoder may hold another key packet than is noted.

@@ -97,7 +97,7 @@ impl Room {
             sink.put(self.nanos(), under_way(session, Slot::MAIN, ELSEWHERE));
         }
         if let Some(key) = state.key.as_ref().filter(|_| !state.publishers.is_empty() || fed.is_some()) {
-            sink.put(self.nanos(), Item::Packet(key.framed.to_packet()));
+            sink.put(self.nanos(), Item::Packet(key.framed.to_payload()));
         }
         state.fed_session = fed.map(|session| (session, 0));
         state.recording = Some(sink);

@@ -65,10 +65,10 @@ async fn run(hub: &Hub, out: &VmcOut) {
         let Some(latest) = viewing.slot.borrow_and_update().clone() else { continue };
         if key != latest.key.index {
             key = latest.key.index;
-            decoder.decode(latest.key.framed.packet(), &mut frame).expect("a packet of the room's own encoder can be read");
+            decoder.decode(latest.key.framed.payload(), &mut frame).expect("a packet of the room's own encoder can be read");
         }
         if let Some(delta) = &latest.delta {
-            decoder.decode(delta.packet(), &mut frame).expect("a packet of the room's own encoder can be read");
+            decoder.decode(delta.payload(), &mut frame).expect("a packet of the room's own encoder can be read");
         }
         // Each session has its own clock.
         let (_, began) =

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Wake, Waker};
 use std::time::Duration;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio::time::{Instant, Sleep};
 
 /// Viewers of a group: a thousand are four groups, so that four cores can serve them.
@@ -25,80 +25,73 @@ const STRETCH: usize = 32;
 /// A timer that is due at no time.
 const NEVER: Duration = Duration::from_secs(86_400);
 
+/// A lock that a panicking holder left is still whole: every change under it is one step.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// All viewers of a room.
 #[derive(Default)]
 pub(crate) struct Audience {
-    groups: Mutex<Vec<Door>>,
+    groups: Mutex<Vec<Arc<Lobby>>>,
 }
 
-/// The way into a group.
-struct Door {
-    seats: Arc<Semaphore>,
-    /// Holds as many as there are seats.
-    newcomers: mpsc::UnboundedSender<Newcomer>,
+/// Where a group's task is called.
+struct Lobby {
+    /// One for each viewer that may be in the group.
+    free: Arc<Semaphore>,
+    newcomers: Mutex<Vec<Newcomer>>,
+    /// Seats of those who have called, each once.
+    calls: Mutex<Vec<usize>>,
+    task: AtomicWaker,
 }
 
-/// A viewer and its seat, which is free again when it is dropped.
+/// A viewer on its way in. The permit is given back when it is dropped.
 struct Newcomer {
     member: Member,
-    seat: OwnedSemaphorePermit,
+    permit: OwnedSemaphorePermit,
 }
 
 impl Audience {
     /// Serves `member` from now on.
     pub fn enter(&self, hub: &Arc<Hub>, member: Member) {
-        let mut groups = self.groups();
-        let found = groups.iter().find_map(|door| Some((door.seats.clone().try_acquire_owned().ok()?, &door.newcomers)));
-        let (seat, newcomers) = match found {
-            Some(found) => found,
-            None => {
-                let (newcomers, arrivals) = mpsc::unbounded_channel();
-                let seats = Arc::new(Semaphore::new(GROUP));
-                let seat = seats.clone().try_acquire_owned().expect("nobody else knows of it");
-                let viewing = member.viewing();
-                let group = Group {
-                    hub: hub.clone(),
-                    room: viewing.room.clone(),
-                    news: viewing.slot.clone(),
-                    seats: seats.clone(),
-                    arrivals,
-                    seated: Slab::new(),
-                    calls: Arc::default(),
-                };
-                groups.push(Door { seats, newcomers });
-                tokio::spawn(group.run());
-                (seat, &groups[groups.len() - 1].newcomers)
-            }
-        };
-        // A group leaves the list, which is locked, before it ends.
-        let _ = newcomers.send(Newcomer { member, seat });
-    }
-
-    fn groups(&self) -> MutexGuard<'_, Vec<Door>> {
-        // Doors come and go whole.
-        self.groups.lock().unwrap_or_else(PoisonError::into_inner)
+        let mut groups = lock(&self.groups);
+        let found = groups.iter().find_map(|lobby| Some((lobby, lobby.free.clone().try_acquire_owned().ok()?)));
+        if let Some((lobby, permit)) = found {
+            return lobby.enter(Newcomer { member, permit });
+        }
+        let free = Arc::new(Semaphore::new(GROUP));
+        let permit = free.clone().try_acquire_owned().expect("nobody else knows of it");
+        let lobby = Arc::new(Lobby { free, newcomers: Mutex::default(), calls: Mutex::default(), task: AtomicWaker::new() });
+        let viewing = member.viewing();
+        let (room, news) = (viewing.room.clone(), viewing.slot.clone());
+        lobby.enter(Newcomer { member, permit });
+        groups.push(lobby.clone());
+        tokio::spawn(Group { hub: hub.clone(), room, news, lobby, seats: Slab::new() }.run());
     }
 }
 
-/// Who of a group has called for its task, by place.
-#[derive(Default)]
-struct Calls {
-    places: Mutex<Vec<usize>>,
-    task: AtomicWaker,
-}
+impl Lobby {
+    /// Under the lock of the groups: a group leaves their list, which nobody is on the way into.
+    fn enter(&self, newcomer: Newcomer) {
+        lock(&self.newcomers).push(newcomer);
+        self.task.wake();
+    }
 
-impl Calls {
-    fn places(&self) -> MutexGuard<'_, Vec<usize>> {
-        self.places.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Ready when there is somebody.
+    fn poll(&self, cx: &Context<'_>) -> Poll<()> {
+        self.task.register(cx.waker());
+        let is_empty = lock(&self.newcomers).is_empty() && lock(&self.calls).is_empty();
+        if is_empty { Poll::Pending } else { Poll::Ready(()) }
     }
 }
 
 /// What a viewer's socket wakes its group's task with.
 struct Ringer {
-    place: usize,
-    /// It is among the calls; so each viewer is there once.
+    seat: usize,
+    /// The seat is among the calls.
     has_rung: AtomicBool,
-    calls: Arc<Calls>,
+    lobby: Arc<Lobby>,
 }
 
 impl Wake for Ringer {
@@ -108,8 +101,8 @@ impl Wake for Ringer {
 
     fn wake_by_ref(self: &Arc<Self>) {
         if !self.has_rung.swap(true, Ordering::AcqRel) {
-            self.calls.places().push(self.place);
-            self.calls.task.wake();
+            lock(&self.lobby.calls).push(self.seat);
+            self.lobby.task.wake();
         }
     }
 }
@@ -121,9 +114,12 @@ pub(super) struct Bell {
 }
 
 impl Bell {
-    fn new(place: usize, calls: Arc<Calls>) -> Self {
-        let ringer = Arc::new(Ringer { place, has_rung: AtomicBool::new(false), calls });
-        Self { waker: Waker::from(ringer.clone()), ringer }
+    /// Rung, so that the viewer is looked at.
+    fn ringing(seat: usize, lobby: Arc<Lobby>) -> Self {
+        let ringer = Arc::new(Ringer { seat, has_rung: AtomicBool::new(false), lobby });
+        let waker = Waker::from(ringer.clone());
+        waker.wake_by_ref();
+        Self { ringer, waker }
     }
 
     /// What polls on the viewer's behalf.
@@ -132,11 +128,11 @@ impl Bell {
     }
 }
 
-/// A viewer in its place.
+/// A viewer in its seat.
 struct Seated {
     member: Member,
     bell: Bell,
-    _seat: OwnedSemaphorePermit,
+    _permit: OwnedSemaphorePermit,
 }
 
 /// Some viewers of a room, and what their task needs.
@@ -144,11 +140,8 @@ struct Group {
     hub: Arc<Hub>,
     room: Arc<Room>,
     news: watch::Receiver<Option<Arc<Latest>>>,
-    /// Its door's.
-    seats: Arc<Semaphore>,
-    arrivals: mpsc::UnboundedReceiver<Newcomer>,
-    seated: Slab<Seated>,
-    calls: Arc<Calls>,
+    lobby: Arc<Lobby>,
+    seats: Slab<Seated>,
 }
 
 impl Group {
@@ -157,142 +150,110 @@ impl Group {
         let timer = tokio::time::sleep(NEVER);
         tokio::pin!(timer);
         loop {
-            self.wait(timer.as_mut()).await;
-            while let Ok(newcomer) = self.arrivals.try_recv() {
-                self.seat(newcomer);
-            }
+            let has_news = self.wait(timer.as_mut()).await;
+            self.let_in();
             if *self.hub.shutdown.borrow() {
                 return self.close();
             }
             let mut next = self.answer_calls();
             let is_due = Instant::now() >= timer.deadline();
-            if is_due || self.news.has_changed().is_ok_and(|changed| changed) {
+            if has_news || is_due {
                 next = next.min(self.walk(is_due).await);
             }
             // Mostly what is due is due later than the timer says; then the timer is moved when it fires.
             if is_due || next < timer.deadline() {
                 timer.as_mut().reset(next);
             }
-            if self.seated.is_empty() && self.leaves() {
+            if self.seats.is_empty() && self.leaves() {
                 return;
             }
         }
     }
 
-    /// Waits until there is something to do, whatever it is.
-    async fn wait(&mut self, timer: Pin<&mut Sleep>) {
-        let Self { news, arrivals, calls, .. } = self;
-        let called = poll_fn(|cx| {
-            calls.task.register(cx.waker());
-            if calls.places().is_empty() { Poll::Pending } else { Poll::Ready(()) }
-        });
+    /// Waits until there is something to do; true where it is a new state.
+    async fn wait(&mut self, timer: Pin<&mut Sleep>) -> bool {
         tokio::select! {
             biased;
-            // The sender is the room's, which is held here.
-            changed = news.changed() => if changed.is_ok() { news.mark_changed() },
-            newcomer = arrivals.recv() => self.seated.reserve(1),
-            () = called => {}
-            () = timer => {}
+            // Its sender is the room's, which is held here.
+            _ = self.news.changed() => true,
+            () = poll_fn(|cx| self.lobby.poll(cx)) => false,
+            () = timer => false,
         }
     }
 
-    /// Gives a newcomer its place. It is looked at with the calls.
-    fn seat(&mut self, Newcomer { member, seat }: Newcomer) {
-        let entry = self.seats.vacant_entry();
-        let bell = Bell::new(entry.key(), self.calls.clone());
-        bell.waker.wake_by_ref();
-        entry.insert(Seated { member, bell, _seat: seat });
+    /// Gives newcomers their seats. They are looked at with the calls.
+    fn let_in(&mut self) {
+        for Newcomer { member, permit } in std::mem::take(&mut *lock(&self.lobby.newcomers)) {
+            let entry = self.seats.vacant_entry();
+            let bell = Bell::ringing(entry.key(), self.lobby.clone());
+            entry.insert(Seated { member, bell, _permit: permit });
+        }
     }
 
-    /// Looks at all who have called; when one of them is to be looked at next.
+    /// Looks at those who have called, some at a time; when one of them is to be looked at next.
     fn answer_calls(&mut self) -> Instant {
-        let places = std::mem::take(&mut *self.calls.places());
-        let (latest, now) = (self.news.borrow().clone(), Instant::now());
+        let seats: Vec<usize> = {
+            let mut calls = lock(&self.lobby.calls);
+            let num = calls.len().min(STRETCH);
+            calls.drain(..num).collect()
+        };
+        self.look(seats, |seated, now| {
+            // From here on it may call again.
+            seated.bell.ringer.has_rung.store(false, Ordering::Release);
+            seated.member.answer(&seated.bell, now)
+        })
+    }
+
+    /// Shows everybody the newest state, and does what the time asks for where `is_due`; when that is due again.
+    async fn walk(&mut self, is_due: bool) -> Instant {
+        let mut next = Instant::now() + NEVER;
+        for first in (0..self.seats.capacity()).step_by(STRETCH) {
+            if first > 0 {
+                tokio::task::yield_now().await;
+            }
+            let hub = self.hub.clone();
+            let tick = |seated: &mut Seated, now| if is_due { seated.member.tick(&hub, &seated.bell, now) } else { Ok(()) };
+            next = next.min(self.look(first..first + STRETCH, tick));
+        }
+        next
+    }
+
+    /// Does `first` with those who sit in `seats` and shows them the newest state; who must go goes. When one of them is to be looked
+    /// at next.
+    fn look(&mut self, seats: impl IntoIterator<Item = usize>, mut first: impl FnMut(&mut Seated, Instant) -> Result<(), Stop>) -> Instant {
+        let (latest, now) = (self.news.borrow_and_update().clone(), Instant::now());
         let mut next = now + NEVER;
         let mut counts = Counts::default();
-        for &place in &places {
-            let hub = &self.hub;
-            // It may have left, or be another's place by now, who is looked at without need.
-            let Some(seated) = self.seats.get_mut(place) else { continue };
-            let Seated { member, bell, .. } = seated;
-            // From here on it may call again.
-            bell.ringer.has_rung.store(false, Ordering::Release);
-            let looked = member.answer(bell, now).and_then(|()| match &latest {
-                Some(latest) => member.show(latest, hub, bell, now, &mut counts),
+        for seat in seats {
+            // Who called may have left, or left the seat to another, who is looked at without need.
+            let Some(seated) = self.seats.get_mut(seat) else { continue };
+            let looked = first(seated, now).and_then(|()| match &latest {
+                Some(latest) => seated.member.show(latest, &self.hub, &seated.bell, now, &mut counts),
                 None => Ok(()),
             });
             match looked {
-                Ok(()) => next = next.min(member.next_tick(hub, now)),
-                Err(stop) => self.dismiss(place, stop),
+                Ok(()) => next = next.min(seated.member.next_tick(&self.hub, now)),
+                Err(stop) => self.seats.remove(seat).member.end(stop, self.hub.clone()),
             }
         }
-        self.count(&counts);
+        counts.add_to(&self.hub.metrics);
         next
-    }
-
-    /// Shows everybody the newest state, and does what the time asks for where `ticks` says so; when that is next due.
-    async fn walk(&mut self, ticks: bool) -> Instant {
-        let mut next = Instant::now() + NEVER;
-        let mut place = 0;
-        while place < self.seats.capacity() {
-            // Whoever comes later in the walk sees what is the newest then.
-            let (latest, now) = (self.news.borrow_and_update().clone(), Instant::now());
-            let mut counts = Counts::default();
-            for _ in 0..STRETCH {
-                let hub = &self.hub;
-                if let Some(Seated { member, bell, .. }) = self.seats.get_mut(place) {
-                    let ticked = if ticks { member.tick(hub, bell, now) } else { Ok(()) };
-                    let looked = ticked.and_then(|()| match &latest {
-                        Some(latest) => member.show(latest, hub, bell, now, &mut counts),
-                        None => Ok(()),
-                    });
-                    match looked {
-                        Ok(()) => next = next.min(member.next_tick(hub, now)),
-                        Err(stop) => self.dismiss(place, stop),
-                    }
-                }
-                place += 1;
-            }
-            self.count(&counts);
-            if place < self.seats.capacity() {
-                tokio::task::yield_now().await;
-            }
-        }
-        next
-    }
-
-    fn count(&self, counts: &Counts) {
-        let metrics = &self.hub.metrics;
-        if counts.frames > 0 {
-            metrics.frames_out.inc_by(counts.frames);
-            metrics.bytes_out.inc_by(counts.bytes);
-        }
-        if counts.skipped > 0 {
-            metrics.drop_frames("slow_viewer", counts.skipped);
-        }
-    }
-
-    fn dismiss(&mut self, place: usize, stop: Stop) {
-        self.seats.remove(place).member.end(stop, self.hub.clone());
     }
 
     /// True where nobody is on the way in; then nobody comes any more.
-    fn leaves(&mut self) -> bool {
-        let mut groups = self.room.audience.groups();
-        if !self.arrivals.is_empty() {
-            return false;
+    fn leaves(&self) -> bool {
+        let mut groups = lock(&self.room.audience.groups);
+        let leaves = lock(&self.lobby.newcomers).is_empty();
+        if leaves {
+            groups.retain(|lobby| !Arc::ptr_eq(lobby, &self.lobby));
         }
-        self.arrivals.close();
-        groups.retain(|door| !door.newcomers.is_closed());
-        true
+        leaves
     }
 
     /// Sends all away: the service ends.
     fn close(mut self) {
-        self.room.audience.groups().retain(|door| !door.newcomers.same_channel_as(&self.arrivals));
-        self.arrivals.close();
-        while let Ok(Newcomer { member, .. }) = self.arrivals.try_recv() {
-            member.end(Ending::shutdown().into(), self.hub.clone());
+        while !self.leaves() {
+            self.let_in();
         }
         for Seated { member, .. } in self.seats.drain() {
             member.end(Ending::shutdown().into(), self.hub.clone());

@@ -4,7 +4,8 @@ use super::LARGEST_MESSAGE;
 use super::audience::Bell;
 use super::pace::Pace;
 use crate::config::seconds;
-use crate::framed::Framed;
+use crate::framed::ping;
+use crate::metrics::Metrics;
 use crate::room::{Latest, Viewing};
 use crate::service::{Allowance, Hub, Place};
 use crate::socket::{Ending, ErrorMessage, Socket, Stop, broken, end};
@@ -59,14 +60,6 @@ enum Outgoing {
     Pong { since: Instant },
 }
 
-/// What one look at a viewer counts.
-#[derive(Default)]
-pub(super) struct Counts {
-    pub frames: u64,
-    pub bytes: u64,
-    pub skipped: u64,
-}
-
 impl Member {
     pub fn new(socket: Socket, viewing: Viewing, wants_json: bool, expires: Option<Instant>, place: Option<Arc<Place>>) -> Self {
         Self {
@@ -93,15 +86,17 @@ impl Member {
         }
         self.pace.last_packet = now;
         let with_ping = self.pace.takes_ping(now);
-        let needs_key = self.sent.key != latest.key.index;
-        let num_bytes = match (&latest.delta, needs_key) {
-            _ if self.wants_json => self.write(latest.json(&hub.layout, &hub.hello_character), with_ping, bell, now)?,
-            (Some(delta), false) => self.write(delta, with_ping, bell, now)?,
-            (None, _) => self.write(&latest.key.framed, with_ping, bell, now)?,
-            (Some(delta), true) => self.write(&latest.key.framed.before(delta), with_ping, bell, now)?,
-        };
+        let (key, newest) = (&latest.key.framed, latest.delta.as_ref().unwrap_or(&latest.key.framed));
+        if !self.wants_json && latest.delta.is_some() && self.sent.key != latest.key.index {
+            counts.bytes += key.payload().len() as u64;
+            let both = key.to_frames_before(newest, with_ping);
+            self.write(&both, || both.clone(), bell, now)?;
+        } else {
+            let newest = if self.wants_json { latest.json(&hub.layout, &hub.hello_character) } else { newest };
+            self.write(newest.frames(with_ping), || newest.to_frames(with_ping), bell, now)?;
+        }
         counts.frames += 1;
-        counts.bytes += num_bytes as u64;
+        counts.bytes += newest.payload().len() as u64;
         if self.sent.state > 0 {
             counts.skipped += latest.index - self.sent.state - 1;
         }
@@ -109,9 +104,9 @@ impl Member {
         Ok(())
     }
 
-    /// Writes `framed`, or as much of it as the kernel takes; the bytes of the payload. Nothing else is being written.
-    fn write(&mut self, framed: &Framed, with_ping: bool, bell: &Bell, now: Instant) -> Result<usize, Stop> {
-        let frames = framed.frames(with_ping);
+    /// Writes `frames`, or as much as the kernel takes and the rest later: then they are wanted as bytes to keep. Nothing else is
+    /// being written.
+    fn write(&mut self, frames: &[u8], keep: impl FnOnce() -> Bytes, bell: &Bell, now: Instant) -> Result<(), Stop> {
         let mut cx = bell.context();
         let wire = Pin::new(self.socket.get_mut());
         let num_written = match wire.poll_write(&mut cx, frames) {
@@ -120,10 +115,10 @@ impl Member {
             Poll::Pending => 0,
         };
         if num_written < frames.len() || self.socket.get_ref().is_encrypted() {
-            self.outgoing = Outgoing::Rest { bytes: framed.to_frames(with_ping).slice(num_written..), since: now };
+            self.outgoing = Outgoing::Rest { bytes: keep().slice(num_written..), since: now };
             self.go_on(bell)?;
         }
-        Ok(framed.payload().len())
+        Ok(())
     }
 
     /// Goes on with what was begun; the bell rings when there is more to do.
@@ -193,7 +188,7 @@ impl Member {
             return Err(Stop::Gone("write_timeout"));
         }
         if self.writes_since().is_none() && now >= self.pace.next_wake(seconds(timeouts.ping), now) && self.pace.takes_ping(now) {
-            self.write(&Framed::ping(), false, bell, now)?;
+            self.write(&ping(), ping, bell, now)?;
         }
         Ok(())
     }
@@ -233,5 +228,25 @@ impl Member {
             end(*socket, stop, &hub.metrics).await;
             drop(place);
         });
+    }
+}
+
+/// What looks at viewers count.
+#[derive(Default)]
+pub(super) struct Counts {
+    pub frames: u64,
+    pub bytes: u64,
+    pub skipped: u64,
+}
+
+impl Counts {
+    pub fn add_to(&self, metrics: &Metrics) {
+        if self.frames > 0 {
+            metrics.frames_out.inc_by(self.frames);
+            metrics.bytes_out.inc_by(self.bytes);
+        }
+        if self.skipped > 0 {
+            metrics.drop_frames("slow_viewer", self.skipped);
+        }
     }
 }
