@@ -154,22 +154,21 @@ impl Codes {
         layout: &PacketLayout,
         coder: &mut impl Coder,
     ) -> Result<(), PacketError> {
-        let mut seen = [[0.0; MAX_BONES]; 3];
+        let mut expected = [[0.0f32; MAX_BONES]; 3];
         for i in 0..layout.moving.len() {
             let slope = slope_at(base.points[i], layout.slopes[i]);
             let mut slide = 0.0;
             for axis in 0..3 {
                 let field = if axis == 0 { &layout.sideways } else { &layout.upright };
-                let expected = field.expect(i, &seen[axis][..i]);
                 let from = if axis == 2 { slide } else { 0.0 };
                 // The cast saturates; both ends round the same bits.
-                let guess = base.points[i][axis].saturating_add((expected + from).round() as i32).clamp(-POINT_MAX, POINT_MAX);
+                let guess = base.points[i][axis].saturating_add((expected[axis][i] + from).round() as i32).clamp(-POINT_MAX, POINT_MAX);
                 transfer_code(&mut self.points[i][axis], guess, -POINT_MAX..=POINT_MAX, &mut axes[axis], coder)?;
                 let moved = (self.points[i][axis] - base.points[i][axis]) as f32;
                 if axis < 2 {
                     slide += slope[axis] * moved;
                 }
-                seen[axis][i] = field.whiten(i, moved - from, expected);
+                field.tell(i, moved - from, &mut expected[axis]);
             }
         }
         Ok(())

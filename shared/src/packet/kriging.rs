@@ -30,8 +30,8 @@ pub(super) enum Symmetry {
 /// Expects each of `n` values from those before it.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Expectation {
-    /// Lower triangle of the covariance's Cholesky factor, `n` rows of `n`.
-    factor: Vec<f32>,
+    /// Lower triangle of the covariance's Cholesky factor, `n` columns of `n`: a value is told to all behind it at once.
+    columns: Vec<f32>,
     num: usize,
 }
 
@@ -59,17 +59,17 @@ impl Expectation {
                 factor[row * num + column] = if row == column { sum.max(OWN / 2.0).sqrt() } else { sum / factor[column * num + column] };
             }
         }
-        Self { factor: factor.into_iter().map(|value| value as f32).collect(), num }
+        let columns = (0..num).flat_map(|column| (0..num).map(move |row| (row, column)));
+        Self { columns: columns.map(|(row, column)| factor[row * num + column] as f32).collect(), num }
     }
 
-    /// What value `index` is expected to be; `seen` are the whitened values before it.
-    pub fn expect(&self, index: usize, seen: &[f32]) -> f32 {
-        self.factor[index * self.num..][..index].iter().zip(seen).fold(0.0, |sum, (weight, value)| sum + weight * value)
-    }
-
-    /// Value `index`, whitened, for the values after it: `expected` is what [`Self::expect`] gave.
-    pub fn whiten(&self, index: usize, value: f32, expected: f32) -> f32 {
-        (value - expected) / self.factor[index * self.num + index]
+    /// Tells that value `index` is `value`, in their order. `expected` is what each is expected to be, at first 0: those behind change.
+    pub fn tell(&self, index: usize, value: f32, expected: &mut [f32]) {
+        let column = &self.columns[index * self.num..][..self.num];
+        let whitened = (value - expected[index]) / column[index];
+        for (expected, weight) in expected[..self.num].iter_mut().zip(column).skip(index + 1) {
+            *expected += weight * whitened;
+        }
     }
 }
 
@@ -127,10 +127,9 @@ mod tests {
 
     fn expectations(symmetry: Symmetry, values: [f32; 4]) -> [f32; 4] {
         let field = Expectation::new(&FOUR, symmetry);
-        let (mut expected, mut seen) = ([0.0; 4], Vec::new());
-        for i in 0..4 {
-            expected[i] = field.expect(i, &seen);
-            seen.push(field.whiten(i, values[i], expected[i]));
+        let mut expected = [0.0f32; 4];
+        for (i, value) in values.into_iter().enumerate() {
+            field.tell(i, value, &mut expected);
         }
         expected
     }
@@ -149,11 +148,10 @@ mod tests {
     #[test]
     fn points_in_one_place_are_no_trouble() {
         let field = Expectation::new(&[Vec3::splat(0.05); 64], Symmetry::Odd);
-        let mut seen = Vec::new();
+        let mut expected = [0.0f32; 64];
         for i in 0..64 {
-            let expected = field.expect(i, &seen);
-            assert!(expected.is_finite() && expected.abs() < 20.0, "{expected}");
-            seen.push(field.whiten(i, 10.0, expected));
+            assert!(expected[i].is_finite() && expected[i].abs() < 20.0, "{expected:?}");
+            field.tell(i, 10.0, &mut expected);
         }
     }
 
