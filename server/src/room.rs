@@ -28,6 +28,9 @@ use nodes::FedState;
 pub(crate) struct Latest {
     /// Counts the states of the room, over all sessions.
     pub index: u64,
+    /// Counts how often the numbers of sessions have gone back, as where two nodes had the room while they were cut off from each
+    /// other, and it is the other's now. Viewers, who take an older session for a late one, must begin anew.
+    pub era: u64,
     /// The key packet that decodes by itself.
     pub key: Arc<KeyPacket>,
     /// The newest packet where it is not the key packet.
@@ -154,6 +157,7 @@ struct RoomState {
     num_joins: u64,
     num_states: u64,
     key: Option<Arc<KeyPacket>>,
+    eras: Eras,
     /// What the listing shows of the newest frame.
     shown: Option<(u32, u64, bool)>,
     /// By slot, at most [`MAX_SLOTS`].
@@ -193,6 +197,24 @@ struct Publisher {
     num_frames: u64,
     evict: oneshot::Sender<()>,
     controls: mpsc::Sender<Control>,
+}
+
+/// Knows when the numbers of sessions go back, see [`Latest::era`].
+#[derive(Default)]
+struct Eras {
+    count: u64,
+    /// Of the newest state.
+    session: u32,
+}
+
+impl Eras {
+    /// The era of the next state, which is of `session`.
+    fn of(&mut self, session: u32) -> u64 {
+        // Numbers wrap.
+        self.count += u64::from(session.wrapping_sub(self.session).cast_signed() < 0);
+        self.session = session;
+        self.count
+    }
 }
 
 /// A lock that a panicking holder left is still whole: every change under it is complete at each step.
@@ -315,6 +337,7 @@ impl Rooms {
                 num_joins: 0,
                 num_states: 0,
                 key: None,
+                eras: Eras::default(),
                 shown: None,
                 neutrals: BTreeMap::new(),
                 recording: None,
@@ -469,8 +492,9 @@ impl Publishing {
         };
         state.key = Some(key.clone());
         state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
+        let era = state.eras.of(merged.session);
         // Under the lock, so that states stand in the slot in their order.
-        self.room.slot.send_replace(Some(Arc::new(Latest { index, key, delta, json: OnceLock::new() })));
+        self.room.slot.send_replace(Some(Arc::new(Latest { index, era, key, delta, json: OnceLock::new() })));
         true
     }
 

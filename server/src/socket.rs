@@ -79,6 +79,20 @@ impl Ending {
     pub fn shutdown() -> Self {
         Self { error: None, code: CloseCode::Away, reason: "server is shutting down".into() }
     }
+
+    /// The peer shall connect again and begin anew: another node's sessions are the room's now.
+    pub fn moved() -> Self {
+        Self { error: None, code: CloseCode::Restart, reason: "the room has another home now; connect again".into() }
+    }
+
+    /// What it is counted as.
+    fn label(&self) -> &'static str {
+        match (&self.error, self.code) {
+            (Some(error), _) => error.code,
+            (None, CloseCode::Restart) => "moved",
+            (None, _) => "shutdown",
+        }
+    }
 }
 
 /// Why talking to a peer stopped.
@@ -226,7 +240,7 @@ pub(crate) fn broken(error: Error, most: usize) -> Stop {
 pub(crate) async fn end(socket: Socket, stop: Stop, metrics: &Metrics) {
     match stop {
         Stop::End(ending) => {
-            metrics.end(ending.error.as_ref().map_or("shutdown", |error| error.code));
+            metrics.end(ending.label());
             close(socket, &ending).await;
         }
         Stop::Gone(reason) => {

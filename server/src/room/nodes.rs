@@ -237,7 +237,8 @@ impl Room {
         state.epoch = head.epoch;
         state.key = Some(key_packet.clone());
         state.num_states += 1;
-        self.slot.send_replace(Some(Arc::new(Latest { index: state.num_states, key: key_packet, delta, json: OnceLock::new() })));
+        let (index, era) = (state.num_states, state.eras.of(session));
+        self.slot.send_replace(Some(Arc::new(Latest { index, era, key: key_packet, delta, json: OnceLock::new() })));
         self.record_fed(state, session, packet);
         Fed::Taken
     }

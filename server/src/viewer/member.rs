@@ -45,6 +45,8 @@ pub(crate) struct Member {
 struct Sent {
     /// Index of the newest state.
     state: u64,
+    /// Its era.
+    era: u64,
     /// Index of the newest key packet.
     key: u64,
 }
@@ -84,6 +86,9 @@ impl Member {
         if self.sent.state == latest.index || !matches!(self.outgoing, Outgoing::Nothing) || !self.pace.has_credit(now) {
             return Ok(());
         }
+        if self.sent.state > 0 && self.sent.era != latest.era {
+            return Err(Ending::moved().into());
+        }
         self.pace.last_packet = now;
         let with_ping = self.pace.takes_ping(now);
         let (key, newest) = (&latest.key.framed, latest.delta.as_ref().unwrap_or(&latest.key.framed));
@@ -100,7 +105,7 @@ impl Member {
         if self.sent.state > 0 {
             counts.skipped += latest.index - self.sent.state - 1;
         }
-        self.sent = Sent { state: latest.index, key: latest.key.index };
+        self.sent = Sent { state: latest.index, era: latest.era, key: latest.key.index };
         Ok(())
     }
 

@@ -149,6 +149,8 @@ pub fn two_homes() {
     let mut second_demo = b.publisher("demo", HELLO).ready();
     let mut two = [a, b].map(|node| node.publisher("fresh", HELLO).ready());
     second_demo.frame(0.3);
+    let at_loser = Watch::start(&[&b.address], "demo");
+    let false_session = at_loser.wait_for_more("the face of the false home").session;
     two.iter_mut().for_each(|publisher| publisher.frame(0.3));
     cluster.nats.restart();
     let start = Instant::now();
@@ -175,6 +177,10 @@ pub fn two_homes() {
         let is_seen = |watch: &Watch| watch.last().is_some_and(|seen| seen.at > before);
         (is_seen(&demo) && is_seen(&fresh)).then_some(())
     });
+    let session = demo.last().expect("it is seen").session;
+    assert!(session < false_session, "a viewer of the false home's would take {session} for over");
+    wait_for("the face at the false home", || at_loser.last().filter(|seen| seen.session == session));
+    at_loser.assert_onward();
     let sessions = demo.finish().iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();
     assert_eq!(sessions.len(), 1, "the other's packets went nowhere: {sessions:?}");
     let sessions = fresh.finish().iter().map(|seen| seen.session).collect::<std::collections::BTreeSet<_>>();

@@ -75,6 +75,15 @@ impl Watch {
         wait_for(what, || self.last().filter(|seen| seen.at > now))
     }
 
+    /// What it has seen in each connection goes on from what it had seen in that.
+    pub fn assert_onward(&self) {
+        for pair in self.seen.lock().unwrap().windows(2) {
+            let [before, after] = pair else { unreachable!() };
+            let is_next = (after.session, after.seq) >= (before.session, before.seq);
+            assert!(is_next || after.connection > before.connection, "{before:?} before {after:?}");
+        }
+    }
+
     /// Ends it. Nothing was seen that goes backwards: of sessions, of sequence numbers and times within one. The newest state
     /// may come once more, when the viewer is at another node.
     pub fn finish(mut self) -> Vec<Seen> {
@@ -96,6 +105,12 @@ impl Watch {
             assert!(is_next && (after.session > before.session || after.t >= before.t), "{before:?} before {after:?}");
         }
         seen
+    }
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
     }
 }
 
