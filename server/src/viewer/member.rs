@@ -92,16 +92,20 @@ impl Member {
         self.pace.last_packet = now;
         let with_ping = self.pace.takes_ping(now);
         let (key, newest) = (&latest.key.framed, latest.delta.as_ref().unwrap_or(&latest.key.framed));
-        if !self.wants_json && latest.delta.is_some() && self.sent.key != latest.key.index {
-            counts.bytes += key.payload().len() as u64;
+        let num_bytes = if self.wants_json {
+            let text = latest.json(&hub.layout, &hub.hello_character);
+            self.write(text.frames(with_ping), || text.to_frames(with_ping), bell, now)?;
+            text.payload().len()
+        } else if latest.delta.is_some() && self.sent.key != latest.key.index {
             let both = key.to_frames_before(newest, with_ping);
             self.write(&both, || both.clone(), bell, now)?;
+            key.payload().len() + newest.payload().len()
         } else {
-            let newest = if self.wants_json { latest.json(&hub.layout, &hub.hello_character) } else { newest };
             self.write(newest.frames(with_ping), || newest.to_frames(with_ping), bell, now)?;
-        }
+            newest.payload().len()
+        };
         counts.frames += 1;
-        counts.bytes += newest.payload().len() as u64;
+        counts.bytes += num_bytes as u64;
         if self.sent.state > 0 {
             counts.skipped += latest.index - self.sent.state - 1;
         }
