@@ -176,7 +176,8 @@ pub fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weights: &[(
         None => (frontal_pose(model, rays, weights)?, MOST_FIRST_STEPS),
     };
     let mut damping = 1e-6;
-    let mut system = System::at(&pose, model, rays, weights, f64::INFINITY, unit);
+    let points = Points { model, rays, weights, unit };
+    let mut system = System::at(&pose, &points, f64::INFINITY, true);
     if system.nearest <= 0.0 {
         return Err(SolveError::NoFaceShape { problem: "they are so large that the head would reach behind the camera" });
     }
@@ -185,14 +186,16 @@ pub fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weights: &[(
         let turn = rotation::from_vector(DVec3::new(step[0], step[1], step[2]));
         let trial =
             Pose { rotation: (turn * pose.rotation).normalize(), translation: pose.translation + DVec3::new(step[3], step[4], step[5]) };
-        let trial_system = System::at(&trial, model, rays, weights, system.cost, unit);
         let size = step[0].abs().max(step[1].abs()).max(step[2].abs())
             + step[3].abs().max(step[4].abs()).max(step[5].abs()) / pose.translation.z.abs();
+        // Nobody steps on from the last one.
+        let is_last = size < SMALL_STEP;
+        let trial_system = System::at(&trial, &points, system.cost, !is_last);
         // The soft weights let a step raise the plain cost a little while it leaves an outlier behind.
         if trial_system.cost <= system.cost * 1.05 + 1e-18 && trial_system.nearest > 0.0 {
             (pose, system) = (trial, trial_system);
             damping = (damping * 0.1).max(1e-9);
-            if size < SMALL_STEP {
+            if is_last {
                 break;
             }
         } else {
@@ -209,6 +212,14 @@ pub fn refine(guess: Option<Pose>, model: &[DVec3], rays: &[DVec2], weights: &[(
     Ok(Fit { pose, error })
 }
 
+/// What a pose is to explain: `weights` names the stable points of `model` and their `rays`; `unit` is the interocular distance, metres.
+struct Points<'a> {
+    model: &'a [DVec3],
+    rays: &'a [DVec2],
+    weights: &'a [(usize, f64)],
+    unit: f64,
+}
+
 /// Normal equations of one Gauss–Newton step: rotation vector, then translation.
 struct System {
     /// Lower triangle.
@@ -221,8 +232,10 @@ struct System {
 }
 
 impl System {
-    /// `last_cost` is that of the pose before: while the whole pose is off, every residual is large and none an outlier.
-    fn at(pose: &Pose, model: &[DVec3], rays: &[DVec2], weights: &[(usize, f64)], last_cost: f64, unit: f64) -> Self {
+    /// `last_cost` is that of the pose before: while the whole pose is off, every residual is large and none an outlier. Without
+    /// equations, it has cost and distance alone.
+    fn at(pose: &Pose, points: &Points<'_>, last_cost: f64, with_equations: bool) -> Self {
+        let &Points { model, rays, weights, unit } = points;
         let matrix = pose.matrix();
         let soft = (SOFT_RESIDUAL * unit / pose.translation.z).max(2.0 * last_cost.sqrt());
         let per_soft_square = 1.0 / (soft * soft);
@@ -238,6 +251,9 @@ impl System {
             let square = residual.length_squared();
             sum += square * weight;
             total += weight;
+            if !with_equations {
+                continue;
+            }
             let weight = weight / (1.0 + square * per_soft_square);
             let by_shift = [DVec3::new(per_z, 0.0, -x * per_z), DVec3::new(0.0, per_z, -y * per_z)];
             for (gradient, residual) in by_shift.into_iter().zip([residual.x, residual.y]) {
