@@ -28,8 +28,8 @@ use nodes::FedState;
 pub(crate) struct Latest {
     /// Counts the states of the room, over all sessions.
     pub index: u64,
-    /// Counts how often the numbers of sessions have gone back, as where two nodes had the room while they were cut off from each
-    /// other, and it is the other's now. Viewers, who take an older session for a late one, must begin anew.
+    /// Counts how often the numbers of sessions have gone back. They do where two nodes had the room while they were cut off from
+    /// each other, and it is the other's now. Viewers drop frames of an older session, so they must begin anew.
     pub era: u64,
     /// The key packet that decodes by itself.
     pub key: Arc<KeyPacket>,
@@ -203,16 +203,18 @@ struct Publisher {
 #[derive(Default)]
 struct Eras {
     count: u64,
-    /// Of the newest state.
-    session: u32,
+    /// Session and frame of the newest state.
+    newest: (u32, u32),
 }
 
 impl Eras {
-    /// The era of the next state, which is of `session`.
-    fn of(&mut self, session: u32) -> u64 {
+    /// The era of the next state, frame `seq` of `session`.
+    fn of(&mut self, session: u32, seq: u32) -> u64 {
         // Numbers wrap.
-        self.count += u64::from(session.wrapping_sub(self.session).cast_signed() < 0);
-        self.session = session;
+        let since = |newer: u32, older: u32| newer.wrapping_sub(older).cast_signed();
+        let by = since(session, self.newest.0);
+        self.count += u64::from(by < 0 || (by == 0 && since(seq, self.newest.1) < 0));
+        self.newest = (session, seq);
         self.count
     }
 }
@@ -492,7 +494,7 @@ impl Publishing {
         };
         state.key = Some(key.clone());
         state.shown = Some((merged.seq, merged.captured_at_micros, merged.face));
-        let era = state.eras.of(merged.session);
+        let era = state.eras.of(merged.session, merged.seq);
         // Under the lock, so that states stand in the slot in their order.
         self.room.slot.send_replace(Some(Arc::new(Latest { index, era, key, delta, json: OnceLock::new() })));
         true
@@ -623,6 +625,14 @@ mod tests {
             let latest = place.room.slot.borrow().clone().unwrap();
             assert_eq!(latest.delta.as_ref().unwrap_or(&latest.key.framed).payload(), packet);
         }
+    }
+
+    #[test]
+    fn era_begins_where_sessions_go_back_and_not_where_numbers_wrap() {
+        let mut eras = Eras::default();
+        let states = [(1, 0), (1, 7), (3, 0), (u32::MAX / 2, 9), (u32::MAX, 5), (0, 0), (4, u32::MAX), (4, 0)];
+        assert!(states.iter().all(|&(session, seq)| eras.of(session, seq) == 0), "all go on");
+        assert_eq!((eras.of(3, 100), eras.of(3, 101), eras.of(3, 50), eras.of(4, 0)), (1, 1, 2, 2));
     }
 
     #[test]

@@ -80,9 +80,9 @@ impl Ending {
         Self { error: None, code: CloseCode::Away, reason: "server is shutting down".into() }
     }
 
-    /// The peer shall connect again and begin anew: another node's sessions are the room's now.
+    /// The peer shall connect again and begin anew: the numbers of the room's sessions have gone back.
     pub fn moved() -> Self {
-        Self { error: None, code: CloseCode::Restart, reason: "the room has another home now; connect again".into() }
+        Self { error: None, code: CloseCode::Restart, reason: "the room counts its sessions anew; connect again".into() }
     }
 
     /// What it is counted as.
@@ -101,6 +101,16 @@ pub(crate) enum Stop {
     End(Ending),
     /// The peer closed, vanished or does not take what it is sent.
     Gone(&'static str),
+}
+
+impl Stop {
+    /// Counts it among the ends of sockets.
+    pub fn count(&self, metrics: &Metrics) {
+        metrics.end(match self {
+            Self::End(ending) => ending.label(),
+            Self::Gone(reason) => reason,
+        });
+    }
 }
 
 impl From<Ending> for Stop {
@@ -238,15 +248,10 @@ pub(crate) fn broken(error: Error, most: usize) -> Stop {
 
 /// Ends a socket as `stop` says, and counts it.
 pub(crate) async fn end(socket: Socket, stop: Stop, metrics: &Metrics) {
+    stop.count(metrics);
     match stop {
-        Stop::End(ending) => {
-            metrics.end(ending.label());
-            close(socket, &ending).await;
-        }
-        Stop::Gone(reason) => {
-            metrics.end(reason);
-            farewell(socket).await;
-        }
+        Stop::End(ending) => close(socket, &ending).await,
+        Stop::Gone(_) => farewell(socket).await,
     }
 }
 

@@ -108,6 +108,10 @@ impl Rooms {
         if !std::mem::replace(&mut state.is_home, true) {
             state.num_states_before = state.num_states;
             room.end_fed(&mut state);
+            if let Some(fed) = &mut state.fed {
+                // What is shown from here on has other key packets: should this node follow again, it begins with one of that home's.
+                fed.key = (0, 0);
+            }
         }
         (state.epoch, state.is_shared) = (epoch, is_shared);
         // It is not known yet who watches.
@@ -237,7 +241,7 @@ impl Room {
         state.epoch = head.epoch;
         state.key = Some(key_packet.clone());
         state.num_states += 1;
-        let (index, era) = (state.num_states, state.eras.of(session));
+        let (index, era) = (state.num_states, state.eras.of(session, fed.frame.seq));
         self.slot.send_replace(Some(Arc::new(Latest { index, era, key: key_packet, delta, json: OnceLock::new() })));
         self.record_fed(state, session, packet);
         Fed::Taken

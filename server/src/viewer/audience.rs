@@ -9,6 +9,7 @@ use crate::service::Hub;
 use crate::socket::{Ending, Stop};
 use futures_util::task::AtomicWaker;
 use slab::Slab;
+use std::collections::VecDeque;
 use std::future::poll_fn;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,6 +17,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Wake, Waker};
 use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::task::{coop, yield_now};
 use tokio::time::{Instant, Sleep};
 
 /// Viewers of a group: a thousand are four groups, so that four cores can serve them.
@@ -41,8 +43,8 @@ struct Lobby {
     /// One for each viewer that may be in the group.
     free: Arc<Semaphore>,
     newcomers: Mutex<Vec<Newcomer>>,
-    /// Seats of those who have called, each once.
-    calls: Mutex<Vec<usize>>,
+    /// Seats of those who have called, about once each.
+    calls: Mutex<VecDeque<usize>>,
     task: AtomicWaker,
 }
 
@@ -72,7 +74,7 @@ impl Audience {
 }
 
 impl Lobby {
-    /// Under the lock of the groups: a group leaves their list, which nobody is on the way into.
+    /// Called under the groups' lock, so that a group that leaves their list has no newcomer.
     fn enter(&self, newcomer: Newcomer) {
         lock(&self.newcomers).push(newcomer);
         self.task.wake();
@@ -101,7 +103,7 @@ impl Wake for Ringer {
 
     fn wake_by_ref(self: &Arc<Self>) {
         if !self.has_rung.swap(true, Ordering::AcqRel) {
-            lock(&self.lobby.calls).push(self.seat);
+            lock(&self.lobby.calls).push_back(self.seat);
             self.lobby.task.wake();
         }
     }
@@ -155,6 +157,9 @@ impl Group {
             if *self.hub.shutdown.borrow() {
                 return self.close();
             }
+            if !coop::has_budget_remaining() {
+                yield_now().await;
+            }
             let mut next = self.answer_calls();
             let is_due = Instant::now() >= timer.deadline();
             if has_news || is_due {
@@ -183,7 +188,8 @@ impl Group {
 
     /// Gives newcomers their seats. They are looked at with the calls.
     fn let_in(&mut self) {
-        for Newcomer { member, permit } in std::mem::take(&mut *lock(&self.lobby.newcomers)) {
+        let newcomers = std::mem::take(&mut *lock(&self.lobby.newcomers));
+        for Newcomer { member, permit } in newcomers {
             let entry = self.seats.vacant_entry();
             let bell = Bell::ringing(entry.key(), self.lobby.clone());
             entry.insert(Seated { member, bell, _permit: permit });
@@ -192,39 +198,69 @@ impl Group {
 
     /// Looks at those who have called, some at a time; when one of them is to be looked at next.
     fn answer_calls(&mut self) -> Instant {
-        let seats: Vec<usize> = {
+        let mut seats: VecDeque<usize> = {
             let mut calls = lock(&self.lobby.calls);
             let num = calls.len().min(STRETCH);
             calls.drain(..num).collect()
         };
-        self.look(seats, |seated, now| {
-            // From here on it may call again.
-            seated.bell.ringer.has_rung.store(false, Ordering::Release);
-            seated.member.answer(&seated.bell, now)
-        })
-    }
-
-    /// Shows everybody the newest state, and does what the time asks for where `is_due`; when that is due again.
-    async fn walk(&mut self, is_due: bool) -> Instant {
-        let mut next = Instant::now() + NEVER;
-        for first in (0..self.seats.capacity()).step_by(STRETCH) {
-            if first > 0 {
-                tokio::task::yield_now().await;
-            }
-            let hub = self.hub.clone();
-            let tick = |seated: &mut Seated, now| if is_due { seated.member.tick(&hub, &seated.bell, now) } else { Ok(()) };
-            next = next.min(self.look(first..first + STRETCH, tick));
+        let next = self.look(
+            || seats.pop_front(),
+            |seated, now| {
+                // From here on it may call again.
+                seated.bell.ringer.has_rung.store(false, Ordering::Release);
+                seated.member.answer(&seated.bell, now)
+            },
+        );
+        if !seats.is_empty() {
+            // It is their turn before those who have called since.
+            let mut calls = lock(&self.lobby.calls);
+            seats.into_iter().rev().for_each(|seat| calls.push_front(seat));
+            self.lobby.task.wake();
         }
         next
     }
 
+    /// Shows everybody the newest state, and does what the time asks for where `is_due`; when that is due again. Who calls or comes in
+    /// between is looked at in between: a walk through a group, with the tasks of other groups in its pauses, may take long.
+    async fn walk(&mut self, is_due: bool) -> Instant {
+        let mut next = Instant::now() + NEVER;
+        let mut seat = 0;
+        let hub = self.hub.clone();
+        loop {
+            let mut num_left = STRETCH.min(self.seats.capacity().saturating_sub(seat));
+            let stretch = || {
+                num_left = num_left.checked_sub(1)?;
+                seat += 1;
+                Some(seat - 1)
+            };
+            let tick = |seated: &mut Seated, now| if is_due { seated.member.tick(&hub, &seated.bell, now) } else { Ok(()) };
+            next = next.min(self.look(stretch, tick));
+            if seat >= self.seats.capacity() {
+                return next;
+            }
+            yield_now().await;
+            self.let_in();
+            next = next.min(self.answer_calls());
+        }
+    }
+
     /// Does `first` with those who sit in `seats` and shows them the newest state; who must go goes. When one of them is to be looked
     /// at next.
-    fn look(&mut self, seats: impl IntoIterator<Item = usize>, mut first: impl FnMut(&mut Seated, Instant) -> Result<(), Stop>) -> Instant {
-        let (latest, now) = (self.news.borrow_and_update().clone(), Instant::now());
+    ///
+    /// Ends early where the task has done so much that the runtime lets it do no more before its next pause: a socket would seem to
+    /// take and give nothing.
+    fn look(
+        &mut self,
+        mut seats: impl FnMut() -> Option<usize>,
+        mut first: impl FnMut(&mut Seated, Instant) -> Result<(), Stop>,
+    ) -> Instant {
+        // Not marked as seen: it is news for those who are not looked at here.
+        let (latest, now) = (self.news.borrow().clone(), Instant::now());
         let mut next = now + NEVER;
         let mut counts = Counts::default();
-        for seat in seats {
+        while coop::has_budget_remaining()
+            && let Some(seat) = seats()
+        {
             // Who called may have left, or left the seat to another, who is looked at without need.
             let Some(seated) = self.seats.get_mut(seat) else { continue };
             let looked = first(seated, now).and_then(|()| match &latest {
@@ -251,12 +287,21 @@ impl Group {
     }
 
     /// Sends all away: the service ends.
-    fn close(mut self) {
+    fn close(&mut self) {
         while !self.leaves() {
             self.let_in();
         }
         for Seated { member, .. } in self.seats.drain() {
             member.end(Ending::shutdown().into(), self.hub.clone());
         }
+    }
+}
+
+impl Drop for Group {
+    /// However the task ends, nobody enters a group without one.
+    fn drop(&mut self) {
+        lock(&self.room.audience.groups).retain(|lobby| !Arc::ptr_eq(lobby, &self.lobby));
+        // Behind the lock: a viewer that goes takes others.
+        drop(std::mem::take(&mut *lock(&self.lobby.newcomers)));
     }
 }

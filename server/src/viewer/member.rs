@@ -23,8 +23,8 @@ use tokio_tungstenite::tungstenite::{Bytes, Error, Message};
 /// Messages a second from a viewer, after a burst of some seconds' worth: pongs, of which it has eight to send at most, and pings of
 /// its own.
 const MOST_MESSAGES: u32 = 50;
-/// For so long a viewer that is sent away may take to get the rest of what was begun.
-const LAST_WRITE: Duration = Duration::from_secs(1);
+/// How long the rest of a begun packet may take before the last word; with that, less than the service waits for at its end.
+const LAST_WRITE: Duration = Duration::from_millis(300);
 
 /// A viewer of a room.
 pub(crate) struct Member {
@@ -51,8 +51,9 @@ struct Sent {
     key: u64,
 }
 
-/// Who writes to the socket. Packets go around the WebSocket, which would copy them through its buffer; so it must not have
-/// anything of its own to write while a packet is written, nor a packet be half written when it has.
+/// Who writes to the socket. Packets go around the WebSocket, which would copy them through its buffer. It writes by itself only
+/// after it has read a ping or a close, so nothing is read while a packet is half written ([`Member::answer`]), and no packet is
+/// begun while it has a pong to send ([`Member::show`]).
 enum Outgoing {
     /// Nobody.
     Nothing,
@@ -65,7 +66,7 @@ enum Outgoing {
 impl Member {
     pub fn new(socket: Socket, viewing: Viewing, wants_json: bool, expires: Option<Instant>, place: Option<Arc<Place>>) -> Self {
         Self {
-            pace: Pace::new(Instant::now(), viewing.number),
+            pace: Pace::new(Instant::now(), viewing.room.since().into(), viewing.number),
             sent: Sent::default(),
             outgoing: Outgoing::Nothing,
             wants_json,
@@ -186,14 +187,24 @@ impl Member {
     /// Does what the time asks for: a ping where no packet takes one along, or the end.
     pub(super) fn tick(&mut self, hub: &Hub, bell: &Bell, now: Instant) -> Result<(), Stop> {
         let timeouts = &hub.config.timeouts;
-        if now >= self.pace.last_heard + seconds(timeouts.viewer_idle) {
+        let (idle, write) = (seconds(timeouts.viewer_idle), seconds(timeouts.write));
+        let is_late = |member: &Self| {
+            let is_stuck = member.writes_since().is_some_and(|since| now >= since + write);
+            (now >= member.pace.last_heard + idle, is_stuck)
+        };
+        if is_late(self) != (false, false) {
+            // After a pause of this machine what would keep it lies in the socket.
+            self.answer(bell, now)?;
+        }
+        let (is_idle, is_stuck) = is_late(self);
+        if is_idle {
             let message = format!("no pong for {} seconds", timeouts.viewer_idle);
             return Err(Ending::error(CloseCode::Policy, ErrorMessage::new("idle", message)).into());
         }
         if self.expires.is_some_and(|end| now >= end) {
             return Err(Ending::token_expired().into());
         }
-        if self.writes_since().is_some_and(|since| now >= since + seconds(timeouts.write)) {
+        if is_stuck {
             return Err(Stop::Gone("write_timeout"));
         }
         if self.writes_since().is_none() && now >= self.pace.next_wake(seconds(timeouts.ping), now) && self.pace.takes_ping(now) {
@@ -233,8 +244,11 @@ impl Member {
                 io::Result::Ok(())
             };
             let is_whole = matches!(tokio::time::timeout(LAST_WRITE, rest).await, Ok(Ok(())));
-            let stop = if is_whole { stop } else { Stop::Gone("write_timeout") };
-            end(*socket, stop, &hub.metrics).await;
+            if is_whole {
+                end(*socket, stop, &hub.metrics).await;
+            } else {
+                stop.count(&hub.metrics);
+            }
             drop(place);
         });
     }

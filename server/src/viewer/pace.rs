@@ -26,13 +26,16 @@ pub(super) struct Pace {
 }
 
 impl Pace {
-    /// Of the `number`th viewer of a room. The first ping went out with the hello.
+    /// Of the `number`th viewer of a room that is there since `origin`. The first ping went out with the hello.
     ///
     /// Viewers take turns with the pings: if all were asked with the same frame, a room's answers would come at once, in the way
     /// of the frames behind it. Multiples of the golden ratio lie evenly in any interval, however many there are.
-    pub fn new(now: Instant, number: u64) -> Self {
-        let turn = PING_SPACING.mul_f64((number as f64 * 0.618_033_988_75).fract());
-        Self { unanswered: Some(now), last_ping: now, next_ping: now + turn, last_heard: now, last_packet: now, has_answered: false }
+    pub fn new(now: Instant, origin: Instant, number: u64) -> Self {
+        let turn = PING_SPACING.mul_f64((number as f64 * 0.618_033_988_75).fract()).as_nanos();
+        let spacing = PING_SPACING.as_nanos();
+        let wait = (spacing + turn - (now - origin).as_nanos() % spacing) % spacing;
+        let next_ping = now + Duration::from_nanos(wait as u64);
+        Self { unanswered: Some(now), last_ping: now, next_ping, last_heard: now, last_packet: now, has_answered: false }
     }
 
     pub fn hear(&mut self, now: Instant) {
@@ -77,7 +80,7 @@ mod tests {
     fn a_viewer_that_stops_answering_gets_half_a_second_more_at_most() {
         let start = Instant::now();
         let at = |millis: u64| start + Duration::from_millis(millis);
-        let mut pace = Pace::new(start, 0);
+        let mut pace = Pace::new(start, start, 0);
         pace.hear(at(1));
         // Frames every 40 ms; the viewer reads until 2 s and then sleeps.
         let mut last_sent = 0;
@@ -99,7 +102,7 @@ mod tests {
     fn a_viewer_that_never_answers_gets_a_window_and_then_a_trickle() {
         let start = Instant::now();
         let at = |millis: u64| start + Duration::from_millis(millis);
-        let mut pace = Pace::new(start, 0);
+        let mut pace = Pace::new(start, start, 0);
         let mut num_sent = 0;
         for millis in (0..10_000).step_by(40) {
             if pace.has_credit(at(millis)) {
@@ -118,11 +121,32 @@ mod tests {
     }
 
     #[test]
+    fn pings_of_many_viewers_are_spread_over_the_spacing() {
+        let start = Instant::now();
+        let at = |millis: u64| start + Duration::from_millis(millis);
+        // They come over a second, in any order, and answer at once; a frame every 10 ms.
+        let mut paces: Vec<Pace> = (0..300).map(|k| Pace::new(at(k * 7919 % 1000), start, k)).collect();
+        let mut most = 0;
+        for millis in (1000..4000).step_by(10) {
+            let mut num_pings = 0;
+            for pace in &mut paces {
+                pace.hear(at(millis));
+                num_pings += u32::from(pace.takes_ping(at(millis)));
+            }
+            if millis > 1000 {
+                most = most.max(num_pings);
+            }
+        }
+        // 300 in 15 frames.
+        assert!((20..=24).contains(&most), "{most} pings with one frame");
+    }
+
+    #[test]
     fn a_long_round_trip_slows_but_does_not_stop() {
         let start = Instant::now();
         let at = |millis: u64| start + Duration::from_millis(millis);
         for (round_trip, least) in [(0, 250), (100, 250), (250, 250), (500, 150)] {
-            let mut pace = Pace::new(start, 0);
+            let mut pace = Pace::new(start, start, 0);
             pace.hear(start);
             let (mut num_sent, mut pong) = (0, None);
             for millis in (0..10_000).step_by(40) {
@@ -169,7 +193,7 @@ mod tests {
         };
         let mut seen = Vec::new();
         for (from, to) in [(0, weather.breaks_at), (weather.breaks_at + weather.away, u64::MAX)] {
-            let (mut pace, mut sent_state) = (Pace::new(at(from), seed % 100), 0);
+            let (mut pace, mut sent_state) = (Pace::new(at(from), start, seed % 100), 0);
             // Pings whose answers are on their way; the first went out with the hello.
             let mut pongs = std::collections::VecDeque::new();
             let (mut down, mut up) = (from, from);
