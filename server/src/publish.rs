@@ -279,6 +279,8 @@ fn not_opened(error: OpenError) -> Stop {
 fn not_entered(error: LeaseError) -> Stop {
     match error {
         LeaseError::Room(error) => not_opened(error.into()),
+        // As for those who are in already: it is no fault of theirs, and another node takes them.
+        LeaseError::Leaving => Ending::shutdown().into(),
         error => refusal(error.code(), error.to_string()),
     }
 }

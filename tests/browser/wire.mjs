@@ -59,6 +59,24 @@ sockets[2].onopen();
 check("who starts anew takes nothing back", !("resume" in sockets[2].sent[0]));
 link.stop();
 
+// Errors that end a session: which of them the page comes back after.
+const ends = async (messages, isBack) => {
+  const states = [];
+  const publishing = new PublishLink("demo", () => ({ source: "test" }), { state: (state) => states.push(state) });
+  publishing.start();
+  const mine = sockets.at(-1);
+  mine.onopen();
+  for (const message of [...(isBack ? [{ type: "ready", session: 7 }] : []), ...messages]) mine.onmessage({ data: JSON.stringify(message) });
+  await mine.onclose();
+  publishing.stop();
+  return states.at(-2);
+};
+const error = (code) => [{ type: "error", code, message: "words" }];
+check("a node that ends, or asks a cluster in vain, is come back to", (await ends([])) === "lost" && (await ends(error("shutting_down"))) === "lost" && (await ends(error("cluster"))) === "lost");
+check("a slot that is taken is somebody's, unless it was one's own", (await ends(error("room_taken"))) === "taken" && (await ends(error("room_taken"), true)) === "lost");
+check("so is a room at another node", (await ends(error("room_elsewhere"))) === "taken" && (await ends(error("room_elsewhere"), true)) === "lost");
+check("who was sent away, or is wrong, stays away", (await ends(error("taken_over"), true)) === "taken" && (await ends(error("bad_hello"))) === "refused");
+
 // The play bar.
 check("times are minutes and seconds", clockText(0) === "0:00.0" && clockText(75.26) === "1:15.3" && clockText(59.96) === "1:00.0");
 check("sizes are told in words", sizeText(10) === "1 kB" && sizeText(188_000) === "188 kB" && sizeText(2.5e9) === "2.50 GB");

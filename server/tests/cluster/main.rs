@@ -61,6 +61,7 @@ mod linux {
             trial("room_opened_at_two_nodes_without_nats_has_one_home_when_it_is_back", outages::two_homes),
             trial("node_that_starts_without_nats_takes_no_room_that_lives", outages::late_node),
             trial("node_that_ends_takes_no_room_that_it_was_asking_for", outages::leaves_while_it_asks),
+            trial("publisher_that_comes_while_its_node_ends_is_told_to_come_back", outages::comes_while_it_ends),
             trial("lease_that_vanishes_is_claimed_anew_by_its_home", outages::lost_lease),
             trial("rolling_restart_under_load_is_hardly_seen", outages::rolling_restart),
             trial("tracker_over_udp_holds_its_room_before_all_nodes", rooms::tracker_over_udp),

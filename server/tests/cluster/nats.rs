@@ -18,7 +18,7 @@ pub fn free_port() -> u16 {
 
 /// A NATS server with JetStream.
 pub struct Nats {
-    process: Process,
+    pub process: Process,
     pub port: u16,
     pub folder: Arc<tempfile::TempDir>,
     more: Vec<String>,
