@@ -133,6 +133,33 @@ pub fn nats_dies() {
     assert_eq!((sessions.len(), num_twice(&near), num_twice(&far.finish())), (1, 0, 0));
 }
 
+/// A performer calibrates while NATS is away, and later loses the node.
+pub fn neutral_without_nats() {
+    let mut nats = Nats::start();
+    let url = nats.url();
+    let (mut a, b) = (Node::start(&url).ready(), Node::start(&url).ready());
+    nats.kill();
+    for node in [&a, &b] {
+        wait_for("the health to tell it", || node.get("/healthz").unwrap().starts_with("degraded").then_some(()));
+    }
+    let feed = write_feed(nats.folder.path(), 60);
+    let sender = send(&feed, &[&a.address], "demo", &nats.folder.path().join("send.log"));
+    let before = wait_for("a neutral", || neutral(&a, "demo"));
+    // Longer than NATS may take for any one answer.
+    std::thread::sleep(Duration::from_secs(1));
+    nats.restart();
+    for node in [&a, &b] {
+        wait_for("all to join again", || (node.get("/healthz").unwrap() == "ok\n").then_some(()));
+    }
+    // Two rounds, in which what waits is kept.
+    std::thread::sleep(Duration::from_millis(1500));
+    a.kill();
+    drop(sender);
+    let mut again = b.publisher("demo", &HELLO.replace("\"fps\"", "\"takeover\":true,\"keep_neutral\":true,\"fps\""));
+    let ready = again.answer();
+    assert_eq!(ready["kept_neutral"], true, "{ready}, after {before}");
+}
+
 /// Two nodes open one room while NATS is away; the viewer at a third one sees the one that keeps it, and never the other.
 pub fn two_homes() {
     let mut cluster = Cluster::start();
