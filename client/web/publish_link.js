@@ -42,8 +42,8 @@ export class PublishLink {
     this.socket = null;
     this.timer = 0;
     this.wasReadyAt = -Infinity;
-    /** Number of the last session that was ready: who comes back takes its own slot back with it. */
-    this.session = 0;
+    /** Of the last session that was ready its number and key: who comes back takes its own slot back with them. */
+    this.own = { resume: 0 };
     this.numFrames = 0;
     this.numSkipped = 0;
     this.bytes = 0;
@@ -80,7 +80,7 @@ export class PublishLink {
     socket.onopen = () => {
       wasOpen = true;
       const again = this.wasReadyAt > -Infinity;
-      const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true, resume: this.session } : {}) };
+      const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true, ...this.own } : {}) };
       socket.send(JSON.stringify(hello));
     };
     const tooLate = setTimeout(() => socket.close(), PATIENCE);
@@ -97,7 +97,7 @@ export class PublishLink {
       if (message.type === "ready") {
         this.backoff.reset();
         this.wasReadyAt = performance.now();
-        this.session = message.session;
+        this.own = { resume: message.session, resume_key: message.resume_key };
         this.#become("ready", "");
       }
       this.questions.heard(message);

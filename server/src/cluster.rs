@@ -513,8 +513,7 @@ impl Cluster {
     fn let_go(&self, rooms: &Rooms, question: &EnterQuestion) -> EnterAnswer {
         let Ok(room) = RoomName::new(&question.room) else { return EnterAnswer::default() };
         let slots = rooms.slots(&room);
-        let is_the_one = |&(_, session): &(String, u32)| question.resume == Some(session);
-        let is_granted = question.takeover || slots.iter().all(is_the_one);
+        let is_granted = question.takeover || rooms.is_free_for(&room, question.resume().as_ref());
         if is_granted {
             lock(&self.held).remove(&room);
             rooms.evict(&room, None);

@@ -132,6 +132,7 @@ impl<'a> Session<'a> {
             version: PROTOCOL_VERSION,
             room: self.source.room().as_str(),
             session: self.source.session(),
+            resume_key: self.source.resume_key(),
             kept_neutral: self.source.kept_neutral,
             character: &character.name,
             bones: character.bones.iter().map(|bone| bone.name.as_str()).collect(),

@@ -46,13 +46,13 @@ globalThis.WebSocket = class {
 const link = new PublishLink("demo", () => ({ source: "test" }), { state() {} });
 link.start();
 sockets[0].onopen();
-sockets[0].onmessage({ data: JSON.stringify({ type: "ready", session: 7 }) });
+sockets[0].onmessage({ data: JSON.stringify({ type: "ready", session: 7, resume_key: "a1" }) });
 await sockets[0].onclose();
 link.connect(false);
 sockets[1].onopen();
 const [firstHello, again] = [sockets[0].sent[0], sockets[1].sent[0]];
 check("a first hello is nobody's who comes back", !("resume" in firstHello) && !("keep_neutral" in firstHello), JSON.stringify(firstHello));
-check("who comes back names its own session", again.resume === 7 && again.keep_neutral === true && !again.takeover, JSON.stringify(again));
+check("who comes back names its own session", again.resume === 7 && again.resume_key === "a1" && again.keep_neutral === true && !again.takeover, JSON.stringify(again));
 link.stop();
 link.start();
 sockets[2].onopen();

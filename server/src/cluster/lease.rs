@@ -231,7 +231,12 @@ impl Cluster {
     }
 
     async fn claim(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Result<(), LeaseError> {
-        let question = EnterQuestion { room: room.to_string(), takeover: hello.takeover, resume: hello.resume };
+        let question = EnterQuestion {
+            room: room.to_string(),
+            takeover: hello.takeover,
+            resume: hello.resume.as_ref().map(|resume| resume.session),
+            resume_key: hello.resume.as_ref().and_then(|resume| resume.key.clone()),
+        };
         let Some(buckets) = self.buckets.get().filter(|_| self.problem().is_none()) else {
             self.ask_known_home(&question, room, &hello.slot.name).await?;
             return self.hold_alone(rooms, room);

@@ -66,7 +66,7 @@ fn is_well(node: &Node) -> bool {
 /// The server that a node has joined through.
 fn server_of(node: &Node) -> usize {
     let log = node.log();
-    let joined = log.lines().filter(|line| line.contains("joined the cluster")).next_back().unwrap();
+    let joined = log.lines().rfind(|line| line.contains("joined the cluster")).unwrap();
     (0..3).find(|k| joined.contains(&server_name(*k))).unwrap()
 }
 
