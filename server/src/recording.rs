@@ -2,8 +2,8 @@
 //! be played, solved again and compared.
 //!
 //! `format` says what stands in a file, `recorder` makes one beside the live stream and never holds it up, `viewer` from another
-//! machine, `writer` writes for both; `reader` reads any bytes that claim to be one, `faces` and `feed` what is in it. The rest works on files: `verify`,
-//! `recover`, `player`, `export`.
+//! machine, `writer` writes for both; `reader` reads any bytes that claim to be one by what `record` finds in them, `faces` and `feed`
+//! what is in it. The rest works on files: `verify`, `recover`, `player`, `export`.
 
 mod export;
 mod faces;
@@ -13,6 +13,7 @@ mod format;
 pub(crate) mod fuzz;
 mod player;
 mod reader;
+mod record;
 mod recorder;
 mod recover;
 pub(crate) mod text;

@@ -103,15 +103,23 @@ pub fn export_csv(faces: &mut Faces, range: [f64; 2], out: &mut impl Write) -> R
     })
 }
 
+/// Faces farther apart than this, seconds, have a pause between them, in which viewers saw the one before: slower than any camera.
+const PAUSE: f32 = 1.0;
+/// How long before the first face after a pause the last one still stands, seconds.
+const HAND_OVER: f32 = 1.0 / 60.0;
+/// What is nearer to rest than this (metres, quaternions' components) is at rest: less than packets tell apart, more than rounding.
+const AT_REST: f32 = 1e-6;
+
 /// What an animation does to one node.
+#[derive(Default)]
 struct Track {
-    node: usize,
     rotations: Vec<[f32; 4]>,
     translations: Vec<[f32; 3]>,
 }
 
 /// Gives the character's `.glb` with the recording as two animations, `bones` (bones and head) and `shapes` (expression weights and
-/// head): they are two ways to move one face, so a player shall play one. With it the number of faces.
+/// head): they are two ways to move one face, so a player shall play one. Each holds at rest what only the other moves, for programs
+/// that go from one to the other and leave what is not animated where it was. With it the number of faces.
 pub fn export_gltf(faces: &mut Faces, range: [f64; 2], character: &Character, glb: &[u8]) -> Result<(Vec<u8>, u64), ExportError> {
     if faces.recording().character().sha256 != character.sha256 {
         let recorded = &faces.recording().character().name;
@@ -125,8 +133,7 @@ pub fn export_gltf(faces: &mut Faces, range: [f64; 2], character: &Character, gl
 
     let rig = Rig::new(&parsed, character)?;
     let (mut times, mut weights) = (Vec::<f32>::new(), Vec::<f32>::new());
-    let mut tracks: Vec<Track> =
-        rig.moved.iter().map(|moved| Track { node: moved.node, rotations: Vec::new(), translations: Vec::new() }).collect();
+    let mut tracks: Vec<Track> = rig.moved.iter().map(|_| Track::default()).collect();
     let mut first = None;
     let bytes_a_face = 4 + tracks.len() as u64 * 28 + rig.targets.len() as u64 * 4;
     let num = each_face(faces, range, |moment, frame| {
@@ -135,9 +142,17 @@ pub fn export_gltf(faces: &mut Faces, range: [f64; 2], character: &Character, gl
         if times.last().is_some_and(|last| t <= *last) {
             return Ok(());
         }
-        let bytes = bytes_a_face * (times.len() as u64 + 1);
+        let bytes = bytes_a_face * (times.len() as u64 + 2);
         if bytes > MAX_ANIMATION {
             return Err(ExportError::TooLong { bytes });
+        }
+        if times.last().is_some_and(|last| t - last > PAUSE) {
+            times.push(t - HAND_OVER);
+            for track in &mut tracks {
+                track.rotations.extend(track.rotations.last().copied());
+                track.translations.extend(track.translations.last().copied());
+            }
+            weights.extend_from_within(weights.len() - rig.targets.len()..);
         }
         times.push(t);
         rig.pose(character, frame, &mut tracks);
@@ -146,30 +161,52 @@ pub fn export_gltf(faces: &mut Faces, range: [f64; 2], character: &Character, gl
     })?;
 
     let mut file = Additions { document: &mut document, bin: &mut bin };
-    let input = file.accessor("SCALAR", 1, &times, true);
-    let mut channels: [Vec<(usize, &str, usize)>; 2] = Default::default();
-    for track in &tracks {
-        let is_head = track.node == rig.head;
-        let moves = |values: &[f32], width: usize| values.chunks(width).any(|value| value != &values[..width]);
+    let moving = file.accessor("SCALAR", 1, &times, true);
+    // What stays at rest does so from the first key to the last.
+    let ends: &[f32] = if let [first, .., last] = times[..] { &[first, last] } else { &times };
+    let still = file.accessor("SCALAR", 1, ends, true);
+    let mut channels: [Vec<Channel>; 2] = Default::default();
+    for (moved, track) in rig.moved.iter().zip(&tracks) {
+        let is_head = moved.node == rig.head;
         let (rotations, translations) = (track.rotations.as_flattened(), track.translations.as_flattened());
-        for (path, kind, width, values) in [("rotation", "VEC4", 4, rotations), ("translation", "VEC3", 3, translations)] {
-            if moves(values, width) || is_head {
-                let output = file.accessor(kind, width, values, false);
-                channels[0].push((track.node, path, output));
-                if is_head {
-                    channels[1].push((track.node, path, output));
-                }
+        let properties: [(_, _, &[f32], _); 2] =
+            [("rotation", "VEC4", &moved.local.0, rotations), ("translation", "VEC3", &moved.local.1, translations)];
+        for (path, kind, rest, values) in properties {
+            let leaves_rest = |value: &[f32]| value.iter().zip(rest).any(|(value, rest)| (value - rest).abs() > AT_REST);
+            if !is_head && !values.chunks(rest.len()).any(leaves_rest) {
+                continue;
             }
+            let channel = |input, output| Channel { node: moved.node, path, input, output };
+            let keys = channel(moving, file.accessor(kind, rest.len(), values, false));
+            if is_head {
+                channels[1].push(keys);
+            } else {
+                channels[1].push(channel(still, file.accessor(kind, rest.len(), &rest.repeat(ends.len()), false)));
+            }
+            channels[0].push(keys);
         }
+        file.decompose(moved);
     }
     if let Some(node) = rig.mesh_node.filter(|_| weights.iter().any(|weight| *weight != 0.0)) {
-        let output = file.accessor("SCALAR", 1, &weights, false);
-        channels[1].push((node, "weights", output));
+        let none = vec![0.0; rig.targets.len() * ends.len()];
+        for (channels, (input, values)) in channels.iter_mut().zip([(still, &none), (moving, &weights)]) {
+            let output = file.accessor("SCALAR", 1, values, false);
+            channels.push(Channel { node, path: "weights", input, output });
+        }
     }
     for (name, channels) in ["bones", "shapes"].into_iter().zip(channels) {
-        file.animation(name, input, &channels);
+        file.animation(name, &channels);
     }
     Ok((write_glb(&document, &bin)?, num))
+}
+
+/// What moves one property of a node: accessors of times and of values.
+#[derive(Clone, Copy)]
+struct Channel {
+    node: usize,
+    path: &'static str,
+    input: usize,
+    output: usize,
 }
 
 /// What a recording adds to a glTF file.
@@ -203,16 +240,30 @@ impl Additions<'_> {
         self.push("accessors", accessor)
     }
 
-    fn animation(&mut self, name: &str, input: usize, channels: &[(usize, &str, usize)]) {
+    /// Gives a node that is animated its place in parts: a matrix cannot be animated.
+    fn decompose(&mut self, moved: &Moved) {
+        if let Some(node) = self.document["nodes"][moved.node].as_object_mut()
+            && node.remove("matrix").is_some()
+        {
+            let (rotation, translation, scale) = moved.local;
+            node.extend([
+                ("rotation".to_owned(), json!(rotation)),
+                ("translation".to_owned(), json!(translation)),
+                ("scale".to_owned(), json!(scale)),
+            ]);
+        }
+    }
+
+    fn animation(&mut self, name: &str, channels: &[Channel]) {
         if channels.is_empty() {
             return;
         }
         let samplers: Vec<Value> =
-            channels.iter().map(|(.., output)| json!({ "input": input, "output": output, "interpolation": "LINEAR" })).collect();
+            channels.iter().map(|channel| json!({ "input": channel.input, "output": channel.output, "interpolation": "LINEAR" })).collect();
         let channels: Vec<Value> = channels
             .iter()
             .enumerate()
-            .map(|(sampler, (node, path, _))| json!({ "sampler": sampler, "target": { "node": node, "path": path } }))
+            .map(|(sampler, Channel { node, path, .. })| json!({ "sampler": sampler, "target": { "node": node, "path": path } }))
             .collect();
         self.push("animations", json!({ "name": name, "samplers": samplers, "channels": channels }));
     }
@@ -236,6 +287,8 @@ struct Moved {
     follows_head: bool,
     /// Model space at rest.
     rest: Affine3A,
+    /// Below its parent at rest: rotation (x, y, z, w), translation, scale.
+    local: ([f32; 4], [f32; 3], [f32; 3]),
     /// The nearest node above it that is moved, as an index into `Rig::moved`, and where its parent is at rest.
     above: Option<usize>,
     parent_rest: Affine3A,
@@ -283,7 +336,9 @@ impl Rig {
             let above = line(node).skip(1).find_map(|parent| moved.iter().position(|moved| moved.node == parent));
             let parent_rest = parents.get(&node).map_or(Affine3A::IDENTITY, |parent| world(*parent));
             let follows_head = node == head || line(node).skip(1).any(|parent| parent == head);
-            moved.push(Moved { node, bone, follows_head, rest: world(node), above, parent_rest });
+            let (scale, rotation, translation) = locals[node].to_scale_rotation_translation();
+            let local = (rotation.normalize().to_array(), translation.to_array(), scale.to_array());
+            moved.push(Moved { node, bone, follows_head, rest: world(node), local, above, parent_rest });
         }
         let mesh_node =
             gltf.nodes().find(|node| node.mesh().is_some_and(|mesh| mesh.primitives().any(|part| part.morph_targets().len() > 0)));
@@ -303,11 +358,9 @@ impl Rig {
             let local = parent.inverse() * (motion * moved.rest);
             motions.push(motion);
             let (_, mut rotation, translation) = local.to_scale_rotation_translation();
-            if let Some(last) = track.rotations.last() {
-                // The same rotation in the half of its numbers where players interpolate the short way.
-                if Quat::from_array(*last).dot(rotation) < 0.0 {
-                    rotation = -rotation;
-                }
+            // The same rotation in the half of its numbers where players interpolate the short way.
+            if Quat::from_array(*track.rotations.last().unwrap_or(&moved.local.0)).dot(rotation) < 0.0 {
+                rotation = -rotation;
             }
             track.rotations.push(rotation.normalize().to_array());
             track.translations.push(translation.to_array());

@@ -2,10 +2,10 @@
 //! most [`MAX_CHUNK`] bytes in either form, and what is broken is one error that says where.
 
 use super::format::{Entry, MAX_CHUNK, PROFILE, SessionEvent, Topic, VERSION};
-use mcap::records::{Record, op};
+use super::record::Record;
+use mcap::MAGIC;
+use mcap::records::op;
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
-use mcap::{MAGIC, McapError};
 use rhytid_shared::packet::{BatchError, BatchReader, PacketError, PacketLayout};
 use rhytid_shared::view::CharacterHello;
 use std::collections::HashMap;
@@ -15,6 +15,10 @@ use std::path::Path;
 
 /// A record's opcode and length.
 const RECORD_HEAD: u64 = 9;
+/// A finished file's last record, and what ends the file behind it.
+const FOOTER: u64 = RECORD_HEAD + 20 + MAGIC.len() as u64;
+/// Bytes that are read of an index at a time.
+const INDEX_PART: usize = 64 << 10;
 /// Longest record outside chunks that is looked at, bytes: an index of a chunk has less than 100 and 16 a message.
 const MAX_RECORD: usize = 16 << 20;
 /// Most chunks: some three months, and 100 MB of their index.
@@ -106,21 +110,11 @@ impl Recording {
         if length < MAGIC.len() as u64 || file.read_exact(&mut magic).is_err() || magic != *MAGIC {
             return Err(broken("it is no MCAP file".into()));
         }
-        let mut channels = HashMap::new();
-        let (mut chunks, cut_at) = match read_summary(&mut *file, length) {
-            Ok(Some(summary)) => {
-                channels.extend(summary.channels.iter().map(|(id, channel)| (*id, Topic::parse(&channel.topic))));
-                let chunks = summary.chunk_indexes.iter().map(|index| ChunkPlace {
-                    offset: index.chunk_start_offset,
-                    length: index.chunk_length,
-                    start: index.message_start_time,
-                    end: index.message_end_time,
-                });
-                (chunks.collect(), None)
-            }
-            Ok(None) | Err(_) => {
+        let (mut chunks, channels, cut_at) = match read_index(&mut *file, length) {
+            Some(index) => (index.chunks, index.channels, None),
+            None => {
                 let (chunks, end) = scan(&mut *file, length).map_err(io)?;
-                (chunks, Some(end))
+                (chunks, HashMap::new(), Some(end))
             }
         };
         if chunks.len() > MAX_CHUNKS {
@@ -293,11 +287,15 @@ impl Source {
             .map_err(|source| ReadError::Io { path: self.path.clone(), source })?;
         let at = |error: String| ReadError::Broken { path: self.path.clone(), problem: format!("chunk at byte {}: {error}", chunk.offset) };
         let mut entries = Vec::new();
-        match mcap::parse_record(bytes[0], &bytes[RECORD_HEAD as usize..]) {
+        let (head, body) = bytes.split_at(RECORD_HEAD as usize);
+        if head[1..] != (body.len() as u64).to_le_bytes() {
+            return Err(at(format!("its record has not the {} bytes that the index says", chunk.length)).into());
+        }
+        match Record::parse(head[0], body) {
             // Uncompressed chunks have lengths of their own that nobody checks.
-            Ok(Record::Chunk { header, .. }) if header.compression == "zstd" => {}
-            Ok(Record::Chunk { header, .. }) => {
-                return Err(at(format!("it is compressed by {:?}, expected \"zstd\"", header.compression)).into());
+            Ok(Record::Chunk { compression: "zstd" }) => {}
+            Ok(Record::Chunk { compression }) => {
+                return Err(at(format!("it is compressed by {compression:?}, expected \"zstd\"")).into());
             }
             Ok(_) => return Err(at("it is no chunk".into()).into()),
             Err(error) => return Err(at(error.to_string()).into()),
@@ -317,18 +315,15 @@ impl Source {
                     reader.notify_read(num);
                     rest = &rest[num..];
                 }
-                LinearReadEvent::Record { opcode, data } => match mcap::parse_record(opcode, data) {
-                    Ok(Record::Channel(channel)) => {
-                        self.channels.insert(channel.id, Topic::parse(&channel.topic));
+                LinearReadEvent::Record { opcode, data } => match Record::parse(opcode, data) {
+                    Ok(Record::Channel { id, topic }) => {
+                        self.channels.insert(id, Topic::parse(topic));
                     }
-                    Ok(Record::Message { header, data }) => {
-                        let topic = self
-                            .channels
-                            .get(&header.channel_id)
-                            .ok_or_else(|| Unread::Channel(at(format!("channel {} is not there", header.channel_id))))?;
+                    Ok(Record::Message { channel, log_time, publish_time, data }) => {
+                        let topic =
+                            self.channels.get(&channel).ok_or_else(|| Unread::Channel(at(format!("channel {channel} is not there"))))?;
                         if let Some(topic) = topic {
-                            let (log_time, publish_time) = (header.log_time, header.publish_time);
-                            entries.push(Entry { topic: topic.clone(), log_time, publish_time, data: data.into_owned() });
+                            entries.push(Entry { topic: topic.clone(), log_time, publish_time, data: data.to_vec() });
                         }
                     }
                     Ok(_) => {}
@@ -340,23 +335,46 @@ impl Source {
     }
 }
 
-/// The index at the end of a finished file.
-fn read_summary(file: &mut dyn Bytes, length: u64) -> Result<Option<mcap::Summary>, McapError> {
-    let options = SummaryReaderOptions::default().with_file_size(length).with_record_length_limit(MAX_RECORD);
-    let mut reader = SummaryReader::new_with_options(options);
+/// What the end of a finished file says.
+#[derive(Default)]
+struct Index {
+    chunks: Vec<ChunkPlace>,
+    /// By id; nothing for channels that are not ours.
+    channels: HashMap<u16, Option<Topic>>,
+}
+
+/// The index at the end of a finished file; nothing where that is damaged or was never written.
+fn read_index(file: &mut dyn Bytes, length: u64) -> Option<Index> {
+    let footer_at = length.checked_sub(FOOTER)?;
+    let mut footer = [0; FOOTER as usize];
+    file.seek(SeekFrom::Start(footer_at)).ok()?;
+    file.read_exact(&mut footer).ok()?;
+    let (head, body) = footer.split_at(RECORD_HEAD as usize);
+    let begin = u64::from_le_bytes(*body.first_chunk().expect("it is longer"));
+    if head[0] != op::FOOTER || !body.ends_with(MAGIC) || !(MAGIC.len() as u64..footer_at).contains(&begin) {
+        return None;
+    }
+    file.seek(SeekFrom::Start(begin)).ok()?;
+    let options = LinearReaderOptions::default().with_skip_start_magic(true).with_emit_chunks(true).with_record_length_limit(MAX_RECORD);
+    let mut reader = LinearReader::new_with_options(options);
+    let mut index = Index::default();
     while let Some(event) = reader.next_event() {
-        match event? {
-            SummaryReadEvent::SeekRequest(to) => {
-                let at = file.seek(to)?;
-                reader.notify_seeked(at);
-            }
-            SummaryReadEvent::ReadRequest(wanted) => {
-                let num = file.read(reader.insert(wanted))?;
+        match event.ok()? {
+            LinearReadEvent::ReadRequest(_) => {
+                let num = file.read(reader.insert(INDEX_PART)).ok()?;
                 reader.notify_read(num);
             }
+            LinearReadEvent::Record { opcode, data } => match Record::parse(opcode, data).ok()? {
+                Record::Channel { id, topic } => {
+                    index.channels.insert(id, Topic::parse(topic));
+                }
+                // One more than is allowed is enough to refuse it.
+                Record::ChunkIndex(place) if index.chunks.len() <= MAX_CHUNKS => index.chunks.push(place),
+                _ => {}
+            },
         }
     }
-    Ok(reader.finish())
+    Some(index)
 }
 
 /// Finds the chunks of a file that has no index, by the heads of its records; and where the last whole record ends.

@@ -5,6 +5,7 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests fail like tests")]
 
 mod fixture;
+mod gltf;
 #[path = "../process/http.rs"]
 mod http;
 mod player;
