@@ -19,6 +19,7 @@ mod linux {
     mod http;
     mod namespace;
     mod nats;
+    mod nats_cluster;
     mod nodes;
     mod outages;
     #[path = "../process/mod.rs"]

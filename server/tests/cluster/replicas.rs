@@ -1,6 +1,7 @@
 //! Records at three NATS servers: whichever of them dies, rooms go on; and what happens where there are too few.
 
-use super::nats::{Nats, NatsCluster, server_name, wait_long};
+use super::nats::Nats;
+use super::nats_cluster::{NatsCluster, server_name, wait_long};
 use super::nodes::{HELLO, Node};
 use super::process::wait_for;
 use super::senders::{send, write_feed};

@@ -19,8 +19,6 @@ fn main() -> std::process::ExitCode {
 #[cfg(target_os = "linux")]
 #[path = "."]
 mod linux {
-    #[path = "../process/http.rs"]
-    mod http;
     #[path = "../process/memory.rs"]
     mod memory;
     #[path = "../cluster/nats.rs"]
