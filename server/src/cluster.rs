@@ -24,6 +24,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, RwLock, mpsc, watch};
+use tokio::task::JoinSet;
 use tokio_tungstenite::tungstenite::Bytes;
 
 use lease::Entering;
@@ -415,7 +416,7 @@ impl Cluster {
 
     /// Runs the node's part until the service ends.
     pub fn start(self: &Arc<Self>, rooms: Weak<Rooms>, shutdown: &watch::Receiver<bool>) {
-        let mut tasks = tokio::task::JoinSet::new();
+        let mut tasks = JoinSet::new();
         if let Some(outbound) = lock(&self.outbound).take() {
             tasks.spawn(self.clone().send_packets(outbound));
         }
@@ -517,7 +518,7 @@ impl Cluster {
     async fn look_after(self: Arc<Self>, rooms: Weak<Rooms>) {
         let mut round = tokio::time::interval(ROUND);
         round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        let mut watching: Option<tokio::task::JoinHandle<()>> = None;
+        let mut watching = JoinSet::new();
         loop {
             tokio::select! {
                 _ = round.tick() => {}
@@ -548,9 +549,10 @@ impl Cluster {
                 // What it has of them may be older than what is held.
                 lock(&self.held).values_mut().for_each(|held| held.revision = None);
             }
-            let is_watching = !is_new && watching.as_ref().is_some_and(|watching| !watching.is_finished());
-            if !is_watching && let Some(before) = watching.replace(tokio::spawn(self.clone().watch_leases(Arc::downgrade(&rooms)))) {
-                before.abort();
+            while watching.try_join_next().is_some() {}
+            if is_new || watching.is_empty() {
+                watching.shutdown().await;
+                watching.spawn(self.clone().watch_leases(Arc::downgrade(&rooms)));
             }
             if is_new {
                 self.joined.send_replace((connection, Instant::now()));
