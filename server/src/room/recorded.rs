@@ -9,6 +9,9 @@ use tokio_tungstenite::tungstenite::Bytes;
 
 /// What sources at another node are called in a recording.
 const ELSEWHERE: &str = "another node";
+/// Why a recording that nobody asked for ends where its room has moved: the new home records it as this one did. One that somebody
+/// asked for goes on with the packets that come from there.
+pub(super) const ELSEWHERE_NOW: &str = "another node is the room's home now";
 
 /// What a recording says of a session whose packets it has, and no messages that they could be solved from.
 fn under_way(session: u32, slot: &str, source: &str) -> Item {
@@ -105,6 +108,8 @@ impl Room {
 
     /// Records a packet of `session` that came from the room's home at another node, where the room is recorded.
     pub(super) fn record_fed(&self, state: &mut RoomState, session: u32, packet: Bytes) {
+        // Its lease may be heard of after its packets.
+        self.end_recording_by_itself(state, ELSEWHERE_NOW);
         if !state.is_recorded() {
             return;
         }
@@ -126,13 +131,12 @@ impl Room {
         }
     }
 
-    /// Ends a recording that nobody asked for: another node is the room's home now and records it as this one did. One that
-    /// somebody asked for goes on with the packets that come from there.
-    pub(super) fn end_recording_by_itself(&self, state: &mut RoomState) {
+    /// Ends a recording that nobody asked for.
+    pub(super) fn end_recording_by_itself(&self, state: &mut RoomState, reason: &str) {
         if state.records_by_itself
             && let Some(sink) = state.recording.take()
         {
-            sink.put(self.nanos(), Item::Event(SessionEvent::Stop { reason: "another node is the room's home now".into() }));
+            sink.put(self.nanos(), Item::Event(SessionEvent::Stop { reason: reason.into() }));
         }
     }
 

@@ -72,6 +72,10 @@ mod linux {
                 recordings::recording_that_nobody_asked_for_ends_where_its_room_moves,
             ),
             trial(
+                "recording_that_nobody_asked_for_ends_where_its_empty_room_is_entered_elsewhere",
+                recordings::recording_that_nobody_asked_for_ends_where_its_empty_room_is_entered_elsewhere,
+            ),
+            trial(
                 "recording_of_another_nodes_room_is_finished_when_its_node_ends",
                 recordings::recording_of_another_nodes_room_is_finished_when_its_node_ends,
             ),
