@@ -288,6 +288,9 @@ impl Rooms {
             room.record(&state, || before.end());
             state.mixer.leave(before.session);
         }
+        if claim.is_replay {
+            room.end_recording_of_replay(&mut state);
+        }
         if state.is_recorded() {
             recorded(session).into_iter().for_each(|item| room.record(&state, || item));
         }
@@ -538,6 +541,9 @@ impl Drop for Publishing {
             let publisher = state.publishers.remove(at);
             self.room.record(&state, || publisher.end());
             state.mixer.leave(self.session);
+            if !state.publishers.is_empty() {
+                self.room.end_recording_of_replay(&mut state);
+            }
             state.empty_since = Instant::now();
             self.room.metrics.publishers.dec();
         }

@@ -140,6 +140,14 @@ impl Room {
         }
     }
 
+    /// Ends a recording that nobody asked for where nobody but players is left: what is played is recorded only where somebody asks
+    /// for that.
+    pub(super) fn end_recording_of_replay(&self, state: &mut RoomState) {
+        if state.publishers.iter().all(|publisher| publisher.claim.is_replay) {
+            self.end_recording_by_itself(state, "a recording is played in the room");
+        }
+    }
+
     /// How its recording stands.
     pub fn recording(&self) -> Option<RecorderStatus> {
         lock(&self.state).recording.as_ref().map(|sink| sink.status())

@@ -123,6 +123,28 @@ fn a_replay_that_stands_still_leaves_its_room_and_none_is_recorded_unasked() {
 }
 
 #[test]
+fn a_replay_after_a_performance_is_not_recorded_unasked() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("played.mcap"), &character, &hello, &frames);
+    let served = Recorder::into(&folder);
+    let sending = served.keep_sending("1.0");
+    wait_until("its recording", || served.metric("rhytid_recordings") == 1.0 && served.metric("rhytid_frames_in_total") > 10.0);
+    drop(sending);
+    wait_until("its end", || served.json("GET", "/api/rooms", "")["rooms"][0]["publisher"].is_null());
+    assert_eq!(served.metric("rhytid_recordings"), 1.0, "who comes back soon is in the same recording");
+    served.json("POST", "/api/rooms/demo/replay", r#"{"file":"played.mcap","loop":true}"#);
+    wait_until("the performance's end", || served.metric("rhytid_recordings") == 0.0);
+    std::thread::sleep(Duration::from_millis(300));
+    assert_eq!((served.metric("rhytid_recordings"), folder.files().len()), (0.0, 2));
+    // The next performance is recorded again.
+    served.json("DELETE", "/api/rooms/demo/replay", "");
+    let _sending = served.keep_sending("1.0");
+    wait_until("the next recording", || served.metric("rhytid_recordings") == 1.0);
+}
+
+#[test]
 fn a_recording_is_published_again() {
     let folder = Folder::new();
     let first = Recorder::into(&folder);
