@@ -7,6 +7,7 @@ use super::format::SessionEvent;
 use super::reader::{ReadError, Recording};
 use super::recorder::Item;
 use crate::config::seconds;
+use crate::publish::Rate;
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
 use rhytid_shared::{PublishHello, RoomName};
@@ -28,6 +29,9 @@ const HOLD: Duration = Duration::from_millis(50);
 const LOOK: Duration = Duration::from_millis(100);
 /// Speeds that make sense; an infinite one sends everything at once.
 const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=100.0;
+/// Shortest session of a player: a jump, or a loop's beginning, waits until its session may begin. Each reads a chunk and takes one of
+/// the numbers that sessions have.
+const LEAST_SESSION: Duration = Duration::from_millis(50);
 /// Requests of one player that may wait for it: each jump takes it some milliseconds.
 const MOST_WAITING: usize = 64;
 /// Frames sent in a row at infinite speed before commands are looked at.
@@ -393,6 +397,10 @@ struct Player<'a> {
     has_lost_room: bool,
     num_frames: u32,
     status: PlayStatus,
+    /// Where to go, seconds, once another session may begin.
+    jump: Option<f64>,
+    /// As any publisher's: what is played faster leaves faces out.
+    rate: Rate,
     /// The next face's time; it stands in the reader.
     next: Option<Moment>,
     /// The face that is shown.
@@ -419,6 +427,8 @@ impl<'a> Player<'a> {
             seat,
             has_lost_room: false,
             num_frames: 0,
+            jump: None,
+            rate: Rate::new(hub.config.limits.frames_per_second, now.into()),
             next: None,
             anchor: (status.position, now),
             status,
@@ -437,12 +447,15 @@ impl<'a> Player<'a> {
             if self.status.speed.is_infinite() && self.status.playing {
                 due = Some(Instant::now());
             }
+            if self.jump.is_some() {
+                due = Some(self.begun + LEAST_SESSION);
+            }
             let wait =
                 due.map_or(HOLD, |due| due.saturating_duration_since(Instant::now())).min(if self.status.playing { LOOK } else { HOLD });
             match inbox.recv_timeout(wait) {
                 Ok(request) => {
                     self.stands_since = Instant::now();
-                    self.obey(&request)?;
+                    self.obey(&request);
                 }
                 Err(RecvTimeoutError::Disconnected) => return Ok("ended"),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -458,7 +471,13 @@ impl<'a> Player<'a> {
             } else if self.most_standing.is_some_and(|most| self.stands_since.elapsed() >= most) {
                 return Ok("it has stood still for too long");
             }
-            if self.status.playing {
+            if let Some(position) = self.jump {
+                if self.begun.elapsed() >= LEAST_SESSION {
+                    self.jump = None;
+                    self.renew();
+                    self.go_to(position)?;
+                }
+            } else if self.status.playing {
                 self.play()?;
             } else {
                 self.send(Instant::now());
@@ -489,8 +508,8 @@ impl<'a> Player<'a> {
             };
             if is_over {
                 if self.status.repeats && self.status.to > self.status.from {
-                    self.renew();
-                    return self.go_to(self.status.from);
+                    (self.jump, self.status.position) = (Some(self.status.from), self.status.from);
+                    return Ok(());
                 }
                 (self.status.playing, self.status.position) = (false, self.status.to);
                 return Ok(());
@@ -498,14 +517,16 @@ impl<'a> Player<'a> {
             let due = if self.status.speed.is_infinite() { Some(now) } else { self.due().filter(|due| *due <= now) };
             let (Some(next), Some(due)) = (self.next, due) else { return Ok(()) };
             self.shown.clone_from(self.faces.frame());
-            self.send(due);
+            if self.status.speed.is_infinite() || self.rate.take_if_free(due.into()) {
+                self.send(due);
+            }
             self.status.position = self.status.position.max(next.smooth);
             self.next = self.faces.advance()?;
         }
         Ok(())
     }
 
-    fn obey(&mut self, request: &PlayRequest) -> Result<(), ReadError> {
+    fn obey(&mut self, request: &PlayRequest) {
         let now = Instant::now();
         // From here on by the new speed.
         self.anchor = (self.status.position, now);
@@ -518,10 +539,10 @@ impl<'a> Player<'a> {
         self.status.playing = request.playing.unwrap_or(self.status.playing);
         let is_at_end = starts && request.position.is_none() && self.status.position >= self.status.to;
         if let Some(position) = request.position.or(is_at_end.then_some(self.status.from)) {
-            self.renew();
-            self.go_to(position.min(seconds))?;
+            let position = position.min(seconds);
+            // The last of several that come at once.
+            (self.jump, self.status.position) = (Some(position), position);
         }
-        Ok(())
     }
 
     /// Begins a session anew, unless another publisher has the room.

@@ -145,6 +145,39 @@ fn a_replay_after_a_performance_is_not_recorded_unasked() {
 }
 
 #[test]
+fn a_player_keeps_to_the_rates_of_publishers() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("demo.mcap"), &character, &hello, &frames);
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none", "--max-fps", "100"]);
+    let path = "/api/rooms/demo/replay";
+    let room = || served.json("GET", "/api/rooms", "")["rooms"][0].clone();
+    // 2,500 faces a second.
+    served.json("POST", path, r#"{"file":"demo.mcap","loop":true,"speed":100}"#);
+    wait_until("a face", || room()["frame"].is_object());
+    let watched = folder.path("watched.mcap");
+    let recorded = run(&["record", watched.to_str().unwrap(), "--server", &served.url(), "--seconds", "1"]);
+    assert!(recorded.status.success(), "{}", says(&recorded));
+    let mut faces = Faces::new(Recording::open(&watched).unwrap());
+    let mut num = 0;
+    while faces.advance().unwrap().is_some() {
+        num += 1;
+    }
+    assert!((30..150).contains(&num), "{num} faces in a second");
+    // A loop of a millisecond, and jumps all the time.
+    served.json("POST", path, r#"{"from":0,"to":0.001,"position":0}"#);
+    let before = room()["session"].as_u64().unwrap();
+    let start = std::time::Instant::now();
+    while start.elapsed() < Duration::from_secs(1) {
+        assert!([200, 503].contains(&served.request("POST", path, r#"{"position":0}"#).0));
+    }
+    let num = room()["session"].as_u64().unwrap() - before;
+    let most = start.elapsed().as_millis() as u64 / 50 + 2;
+    assert!((3..=most).contains(&num), "{num} sessions, {most} at most");
+}
+
+#[test]
 fn a_recording_is_published_again() {
     let folder = Folder::new();
     let first = Recorder::into(&folder);
