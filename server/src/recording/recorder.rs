@@ -80,10 +80,10 @@ pub enum RecordError {
     #[error("the room is being recorded already")]
     Running,
     /// The file could not be made.
-    #[error("cannot make {path}: {source}")]
+    #[error("cannot make {file}: {source}")]
     Create {
-        /// The file.
-        path: String,
+        /// Its name: where the server keeps it is nobody's business.
+        file: String,
         /// What the system said.
         source: io::Error,
     },
@@ -224,7 +224,7 @@ impl Recorder {
                 Ok(()) => tracing::info!(file, "recording ended"),
                 Err(error) => {
                     metrics.recording_failures.inc();
-                    tracing::error!(file, error, "recording failed; the stream goes on");
+                    tracing::error!(file, folder = %folder.display(), error, "recording failed; the stream goes on");
                 }
             }
             let has_failed = ended.is_err();
@@ -238,7 +238,7 @@ impl Recorder {
             drop(keeps);
         };
         let thread = std::thread::Builder::new().name("recording".into());
-        thread.spawn(run).map_err(|source| RecordError::Create { path: "a thread".into(), source })?;
+        thread.spawn(run).map_err(|source| RecordError::Create { file: "a thread".into(), source })?;
         Ok((Arc::new(sink), is_made))
     }
 }

@@ -111,6 +111,22 @@ fn a_killed_server_leaves_recordings_that_verify() {
 }
 
 #[test]
+fn a_recording_that_cannot_be_made_says_why_and_not_where() {
+    let folder = Folder::new();
+    let takes = folder.path("takes");
+    std::fs::create_dir(&takes).unwrap();
+    let served = Recorder::start(&["serve", "--record", takes.to_str().unwrap(), "--record-rooms", "none"]);
+    std::fs::remove_dir(&takes).unwrap();
+    let (status, answer) = served.request("POST", "/api/rooms/demo/record/start", "");
+    assert_eq!(status, 500, "{answer}");
+    let told = served.request("GET", "/api/rooms", "").1;
+    for text in [answer, told] {
+        assert!(text.contains("cannot make demo-") && text.contains("No such file") && !text.contains(folder.shown()), "{text}");
+    }
+    wait_until("the folder in the log", || served.log().contains(folder.shown()));
+}
+
+#[test]
 fn a_full_disk_ends_the_recording_and_not_the_stream() {
     let folder = Folder::new();
     // 64 blocks of 512 or 1,024 bytes.
