@@ -189,10 +189,20 @@ fn a_recording_is_not_mended_while_it_is_written_and_a_killed_mending_may_be_don
     assert!(std::fs::metadata(&path).unwrap().len() as f64 > before, "it is the file that is written");
     drop(served);
     drop(sending);
+    let name = path.file_name().unwrap().to_str().unwrap();
+    // Somebody's own, and where a mending makes its file a link to it.
+    let own = folder.path(&format!("{name}.mended"));
+    std::fs::write(&own, "mine").unwrap();
+    let left = folder.path(&format!(".{name}.rhytid-mending"));
+    std::os::unix::fs::symlink(&own, &left).unwrap();
+    let refused = run(&["recover", shown]);
+    assert!(!refused.status.success() && says(&refused).contains("cannot write"), "{}", says(&refused));
+    assert!(left.is_symlink());
+    std::fs::remove_file(&left).unwrap();
     // A mending that was killed has left this.
-    let left = folder.path(&format!("{}.mended", path.file_name().unwrap().to_str().unwrap()));
     std::fs::write(&left, vec![7; 100_000]).unwrap();
     let mended = run(&["recover", shown]);
+    assert_eq!(std::fs::read_to_string(&own).unwrap(), "mine");
     assert!(mended.status.success() && says(&mended).contains("kept "), "{}", says(&mended));
     assert!(!left.exists());
     let verified = run(&["verify", shown]);
