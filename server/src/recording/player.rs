@@ -182,6 +182,7 @@ impl Default for Players {
 struct Handle {
     requests: SyncSender<PlayRequest>,
     status: Arc<Mutex<PlayStatus>>,
+    session: Arc<Mutex<u32>>,
 }
 
 /// What stands under these locks is whole at each step.
@@ -283,10 +284,9 @@ impl Players {
         most_standing: Option<Duration>,
     ) -> Result<PlayStatus, PlayError> {
         let mut by_room = lock(&self.by_room);
-        // One of our own in this room makes place; others that have ended are forgotten.
-        let replaces = by_room.remove(room).is_some_and(|handle| lock(&handle.status).error.is_none());
-        by_room.retain(|_, handle| lock(&handle.status).error.is_none());
-        if by_room.len() >= MOST_PLAYERS {
+        // Those that have ended are forgotten. One of our own in this room makes place, once its place is ours.
+        by_room.retain(|name, handle| name == room || lock(&handle.status).error.is_none());
+        if by_room.keys().filter(|name| *name != room).count() >= MOST_PLAYERS {
             return Err(PlayError::TooMany);
         }
         let length = recording.seconds();
@@ -302,13 +302,19 @@ impl Players {
             to: request.to.unwrap_or(length).clamp(from, length),
             error: None,
         };
-        let place = Seat::take(hub, room, &source_of(&status.file), Hold { takeover: request.takeover || replaces, resume: None })?;
+        let place = {
+            // Its session, and no publisher's who has come meanwhile. Held, so that it does not begin another in this moment.
+            let before = by_room.get(room).map(|handle| lock(&handle.session));
+            let hold = Hold { takeover: request.takeover, resume: before.as_deref().copied() };
+            Seat::take(hub, room, &source_of(&status.file), hold)?
+        };
+        let session = Arc::new(Mutex::new(place.place.session));
         let (requests, inbox) = sync_channel(MOST_WAITING);
         let shared = Arc::new(Mutex::new(status.clone()));
-        let handle = Handle { requests, status: shared.clone() };
+        let handle = Handle { requests, status: shared.clone(), session: session.clone() };
         let hub = hub.clone();
         let run = move || {
-            let mut player = Player::new(&hub, Faces::new(recording), place, status, most_standing);
+            let mut player = Player::new(&hub, Faces::new(recording), place, session, status, most_standing);
             let ended = player.run(&inbox, &shared);
             let mut status = lock(&shared);
             status.playing = false;
@@ -394,6 +400,8 @@ struct Player<'a> {
     source: String,
     faces: Faces,
     seat: Seat,
+    /// The seat's, for who takes it over.
+    session: Arc<Mutex<u32>>,
     has_lost_room: bool,
     num_frames: u32,
     status: PlayStatus,
@@ -416,7 +424,14 @@ struct Player<'a> {
 }
 
 impl<'a> Player<'a> {
-    fn new(hub: &'a Hub, faces: Faces, seat: Seat, status: PlayStatus, most_standing: Option<Duration>) -> Self {
+    fn new(
+        hub: &'a Hub,
+        faces: Faces,
+        seat: Seat,
+        session: Arc<Mutex<u32>>,
+        status: PlayStatus,
+        most_standing: Option<Duration>,
+    ) -> Self {
         let now = Instant::now();
         Self {
             hub,
@@ -425,6 +440,7 @@ impl<'a> Player<'a> {
             shown: faces.frame().clone(),
             faces,
             seat,
+            session,
             has_lost_room: false,
             num_frames: 0,
             jump: None,
@@ -550,9 +566,11 @@ impl<'a> Player<'a> {
         if self.is_evicted() {
             return;
         }
-        let resume = Some(self.seat.place.session);
+        let mut session = lock(&self.session);
+        let resume = Some(*session);
         match Seat::take(self.hub, &self.room, &self.source, Hold { resume, ..Hold::default() }) {
             Ok(seat) => {
+                *session = seat.place.session;
                 self.seat = seat;
                 self.num_frames = 0;
                 (self.begun, self.last_micros) = (Instant::now(), None);

@@ -8,6 +8,7 @@ use rhytid_server::recording::{Faces, Recording, export_csv, export_gltf};
 use rhytid_shared::{TrackingData, TrackingFrame};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
+use tokio_tungstenite::tungstenite::Message;
 
 #[test]
 fn a_player_stops_seeks_and_goes_on() {
@@ -175,6 +176,28 @@ fn a_player_keeps_to_the_rates_of_publishers() {
     let num = room()["session"].as_u64().unwrap() - before;
     let most = start.elapsed().as_millis() as u64 / 50 + 2;
     assert!((3..=most).contains(&num), "{num} sessions, {most} at most");
+}
+
+#[test]
+fn a_player_takes_its_forerunners_place_and_no_publishers() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("demo.mcap"), &character, &hello, &frames);
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none"]);
+    let path = "/api/rooms/demo/replay";
+    for round in 0..5 {
+        // So slow that it looks after its room ten times a second.
+        assert_eq!(served.request("POST", path, r#"{"file":"demo.mcap","speed":0.01,"takeover":true}"#).0, 200);
+        let mut socket = crate::socket::open(&served.address, "demo/publish", &[], crate::process::PATIENCE).unwrap();
+        let hello = r#"{"type":"hello","version":1,"source":"test","fps":60,"takeover":true}"#;
+        socket.send(Message::text(hello)).unwrap();
+        let Message::Text(ready) = socket.read().unwrap() else { panic!("an answer") };
+        assert!(ready.contains("ready"), "{ready}");
+        let (status, answer) = served.request("POST", path, r#"{"file":"demo.mcap"}"#);
+        assert_eq!(status, 409, "round {round}: {answer}");
+        assert!(answer.contains("room_taken"), "{answer}");
+    }
 }
 
 #[test]
