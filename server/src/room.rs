@@ -407,11 +407,6 @@ impl Room {
         mixer_time(self.nanos())
     }
 
-    /// When its clock began.
-    pub fn since(&self) -> Instant {
-        self.since
-    }
-
     /// Where commands to the source in this slot go.
     pub fn controls(&self, slot: &str) -> Option<mpsc::Sender<Control>> {
         let state = lock(&self.state);

@@ -1,7 +1,7 @@
 //! What recordings keep of a room.
 
 use super::{Publisher, Room, RoomState, Rooms, lock};
-use crate::recording::{Item, RecordError, RecorderStatus, SessionEvent, Sink};
+use crate::recording::{Item, Made, RecordError, Recorder, RecorderStatus, SessionEvent, Sink};
 use rhytid_shared::Slot;
 use std::sync::Arc;
 use std::time::Instant;
@@ -74,12 +74,14 @@ impl Room {
         lock(&self.state).is_recorded()
     }
 
-    /// Records into `sink` from now on.
-    pub fn record_into(&self, sink: Arc<Sink>) -> Result<(), RecordError> {
+    /// Begins a recording that somebody has asked for. Waits for nothing: whether its file is there is told later.
+    pub fn record_with(&self, recorder: &Recorder) -> Result<Made, RecordError> {
         let mut state = lock(&self.state);
         if state.is_recorded() {
             return Err(RecordError::Running);
         }
+        // Under the lock: of two who ask at once, the second leaves no file.
+        let (sink, made) = recorder.start(&self.name, self.since)?;
         self.begin_recording(&mut state, sink);
         state.records_by_itself = false;
         drop(state);
@@ -87,7 +89,7 @@ impl Room {
             // Where its home is elsewhere, its packets are asked for.
             interest.send_replace(());
         }
-        Ok(())
+        Ok(made)
     }
 
     /// Sessions that are there are noted as under way, with the state that their packets refer to.

@@ -127,6 +127,21 @@ fn a_recording_that_cannot_be_made_says_why_and_not_where() {
 }
 
 #[test]
+fn of_two_who_begin_a_recording_at_once_one_leaves_a_file() {
+    let folder = Folder::new();
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none"]);
+    for room in 0..10 {
+        let path = format!("/api/rooms/room{room}/record/start");
+        let answers = std::thread::scope(|scope| {
+            let asking: Vec<_> = (0..8).map(|_| scope.spawn(|| served.request("POST", &path, "").0)).collect();
+            asking.into_iter().map(|asking| asking.join().unwrap()).collect::<Vec<_>>()
+        });
+        assert_eq!(answers.iter().filter(|status| **status == 200).count(), 1, "{answers:?}");
+    }
+    assert_eq!((folder.files().len(), served.metric("rhytid_recordings")), (10, 10.0));
+}
+
+#[test]
 fn a_full_disk_ends_the_recording_and_not_the_stream() {
     let folder = Folder::new();
     // 64 blocks of 512 or 1,024 bytes.
