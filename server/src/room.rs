@@ -6,6 +6,7 @@ mod recorded;
 
 use crate::cluster::{Kept, RoomOutlet, StateHead};
 use crate::framed::Framed;
+use crate::lock::lock;
 use crate::metrics::Metrics;
 use crate::recording::{Item, Recorder, SessionEvent, Sink};
 use crate::solve::mix::Mixer;
@@ -15,7 +16,7 @@ use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
 use rhytid_shared::{Character, FaceFrame, PublishHello, RoomName, Slot};
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
 
@@ -215,11 +216,6 @@ impl Eras {
         self.session = session;
         self.count
     }
-}
-
-/// A lock that a panicking holder left is still whole: every change under it is complete at each step.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 impl Rooms {

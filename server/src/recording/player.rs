@@ -3,10 +3,10 @@
 
 use super::faces::{Faces, Moment};
 use super::files::room_of_file;
-use super::format::SessionEvent;
 use super::reader::{ReadError, Recording};
 use super::recorder::Item;
 use crate::config::seconds;
+use crate::lock::lock;
 use crate::publish::Rate;
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::Semaphore;
 
@@ -183,11 +183,6 @@ struct Handle {
     requests: SyncSender<PlayRequest>,
     status: Arc<Mutex<PlayStatus>>,
     session: Arc<Mutex<u32>>,
-}
-
-/// What stands under these locks is whole at each step.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Players {
@@ -375,19 +370,7 @@ impl Seat {
     fn take(hub: &Hub, room: &RoomName, source: &str, hold: Hold) -> Result<Self, RoomError> {
         let claim =
             SlotClaim { source: source.to_owned(), takeover: hold.takeover, resume: hold.resume, is_replay: true, ..SlotClaim::default() };
-        let recorded = |session| {
-            let (slot, source) = (claim.slot.name.clone(), claim.source.clone());
-            // Its packets are recorded, and no messages that they could be solved from.
-            vec![Item::Event(SessionEvent::Start {
-                session,
-                slot,
-                source,
-                under_way: true,
-                kept_neutral: None,
-                profile: None,
-                solve: None,
-            })]
-        };
+        let recorded = |session| vec![Item::under_way(session, &claim.slot.name, &claim.source)];
         // Nobody commands it as they would a tracker.
         let (place, evicted) = hub.rooms.claim(room, claim.clone(), tokio::sync::mpsc::channel(1).0, recorded)?;
         Ok(Self { place, evicted })
@@ -424,14 +407,7 @@ struct Player<'a> {
 }
 
 impl<'a> Player<'a> {
-    fn new(
-        hub: &'a Hub,
-        faces: Faces,
-        seat: Seat,
-        session: Arc<Mutex<u32>>,
-        status: PlayStatus,
-        most_standing: Option<Duration>,
-    ) -> Self {
+    fn new(hub: &'a Hub, faces: Faces, seat: Seat, session: Arc<Mutex<u32>>, status: PlayStatus, most_standing: Option<Duration>) -> Self {
         let now = Instant::now();
         Self {
             hub,

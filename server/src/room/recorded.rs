@@ -13,19 +13,6 @@ const ELSEWHERE: &str = "another node";
 /// asked for goes on with the packets that come from there.
 pub(super) const ELSEWHERE_NOW: &str = "another node is the room's home now";
 
-/// What a recording says of a session whose packets it has, and no messages that they could be solved from.
-fn under_way(session: u32, slot: &str, source: &str) -> Item {
-    Item::Event(SessionEvent::Start {
-        session,
-        slot: slot.to_owned(),
-        source: source.to_owned(),
-        under_way: true,
-        kept_neutral: None,
-        profile: None,
-        solve: None,
-    })
-}
-
 impl Rooms {
     /// Begins the recording of a room that is recorded without being asked to. Waits for nothing.
     pub(super) fn record_by_itself(&self, room: &Room, state: &mut RoomState) {
@@ -95,11 +82,11 @@ impl Room {
     /// Sessions that are there are noted as under way, with the state that their packets refer to.
     fn begin_recording(&self, state: &mut RoomState, sink: Arc<Sink>) {
         for Publisher { session, claim, .. } in &state.publishers {
-            sink.put(self.nanos(), under_way(*session, &claim.slot.name, &claim.source));
+            sink.put(self.nanos(), Item::under_way(*session, &claim.slot.name, &claim.source));
         }
         let fed = state.fed.as_ref().filter(|_| !state.is_home).map(|fed| fed.frame.session);
         if let Some(session) = fed {
-            sink.put(self.nanos(), under_way(session, Slot::MAIN, ELSEWHERE));
+            sink.put(self.nanos(), Item::under_way(session, Slot::MAIN, ELSEWHERE));
         }
         if let Some(key) = state.key.as_ref().filter(|_| !state.publishers.is_empty() || fed.is_some()) {
             sink.put(self.nanos(), Item::Packet(key.framed.to_payload()));
@@ -118,7 +105,7 @@ impl Room {
         let before = state.fed_session.filter(|(before, _)| *before == session);
         if before.is_none() {
             self.end_fed(state);
-            self.record(state, || under_way(session, Slot::MAIN, ELSEWHERE));
+            self.record(state, || Item::under_way(session, Slot::MAIN, ELSEWHERE));
         }
         self.record(state, || Item::Packet(packet));
         state.fed_session = Some((session, before.map_or(0, |(_, frames)| frames) + 1));
