@@ -148,7 +148,7 @@ pub async fn watch(
                 }
                 Some(Ok(Message::Close(Some(frame)))) if matches!(frame.code, CloseCode::Restart | CloseCode::Away) => {
                     let CloseFrame { code, reason } = frame;
-                    tracing::info!(code = u16::from(code), %reason, "the server closed; connecting again for {} s", BACK_WITHIN.as_secs());
+                    tracing::warn!(code = u16::from(code), %reason, "the server closed; connecting again for {} s", BACK_WITHIN.as_secs());
                     // The server waits for the answer to its close, which stands ready.
                     let _ = tokio::time::timeout(TRY_AFTER, socket.flush()).await;
                     // It may take a while, in which nothing else looks after the file.
@@ -168,7 +168,7 @@ pub async fn watch(
                             break "the server closed";
                         }
                     }
-                    tracing::info!("connected again; the recording goes on");
+                    tracing::warn!("connected again; the recording goes on");
                     // How many packets there were meanwhile, nobody knows.
                     writer.event(now(), &SessionEvent::Gap { messages: 0 }).map_err(|error| write_error(&error))?;
                 }
