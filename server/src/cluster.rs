@@ -10,6 +10,7 @@ mod feed;
 mod lease;
 mod wire;
 
+use crate::lock::lock;
 use crate::room::{Others, RoomListing, Rooms};
 use crate::service::stopped;
 use async_nats::connection::State;
@@ -21,9 +22,10 @@ use serde::Deserialize;
 use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, RwLock, mpsc, watch};
+use tokio::task::JoinSet;
 use tokio_tungstenite::tungstenite::Bytes;
 
 use lease::Entering;
@@ -280,10 +282,6 @@ pub(crate) struct Cluster {
     keeping: Keeping,
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Cluster {
     /// Starts connecting; NATS may come later.
     pub async fn join(config: &ClusterConfig, url: &str, address: String, character_sha256: &str) -> Result<Arc<Self>, ClusterError> {
@@ -453,7 +451,7 @@ impl Cluster {
 
     /// Runs the node's part until the service ends.
     pub fn start(self: &Arc<Self>, rooms: Weak<Rooms>, shutdown: &watch::Receiver<bool>) {
-        let mut tasks = tokio::task::JoinSet::new();
+        let mut tasks = JoinSet::new();
         if let Some(outbound) = lock(&self.outbound).take() {
             tasks.spawn(self.clone().send_packets(outbound));
         }
@@ -555,7 +553,7 @@ impl Cluster {
     async fn look_after(self: Arc<Self>, rooms: Weak<Rooms>) {
         let mut round = tokio::time::interval(ROUND);
         round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        let mut watching: Option<tokio::task::JoinHandle<()>> = None;
+        let mut watching = JoinSet::new();
         loop {
             tokio::select! {
                 _ = round.tick() => {}
@@ -583,9 +581,10 @@ impl Cluster {
                 // What it has of them may be older than what is held.
                 lock(&self.held).values_mut().for_each(|held| held.revision = None);
             }
-            let is_watching = !is_new && watching.as_ref().is_some_and(|watching| !watching.is_finished());
-            if !is_watching && let Some(before) = watching.replace(tokio::spawn(self.clone().watch_leases(Arc::downgrade(&rooms)))) {
-                before.abort();
+            while watching.try_join_next().is_some() {}
+            if is_new || watching.is_empty() {
+                watching.shutdown().await;
+                watching.spawn(self.clone().watch_leases(Arc::downgrade(&rooms)));
             }
             if is_new {
                 self.joined.send_replace((connection, Instant::now()));

@@ -18,6 +18,7 @@ pub mod fuzz;
 mod http;
 #[cfg(target_os = "linux")]
 pub mod load;
+mod lock;
 mod metrics;
 mod page;
 pub mod pipeline;

@@ -29,7 +29,7 @@ pub use format::{Entry, SessionEvent, Topic};
 pub(crate) use player::Players;
 pub use player::{PlayError, PlayRequest, PlayStatus};
 pub use reader::{ChunkPlace, ReadError, Recording};
-pub(crate) use recorder::{Item, Recorder, RecorderStatus, Sink};
+pub(crate) use recorder::{Item, Made, Recorder, RecorderStatus, Sink};
 pub use recorder::{RecordConfig, RecordError};
 pub use recover::{RecoverError, RecoverReport, recover};
 pub use verify::{Difference, VerifyError, VerifyReport, verify};

@@ -6,6 +6,7 @@ mod recorded;
 
 use crate::cluster::{Kept, RoomOutlet, StateHead};
 use crate::framed::Framed;
+use crate::lock::lock;
 use crate::metrics::Metrics;
 use crate::recording::{Item, Recorder, SessionEvent, Sink};
 use crate::solve::mix::Mixer;
@@ -16,7 +17,7 @@ use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
 use rhytid_shared::{Character, FaceFrame, PublishHello, Resume, RoomName, Slot};
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot, watch};
 
@@ -230,11 +231,6 @@ impl Publisher {
     }
 }
 
-/// A lock that a panicking holder left is still whole: every change under it is complete at each step.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
-}
-
 impl Rooms {
     pub fn new(
         character: Arc<Character>,
@@ -300,6 +296,9 @@ impl Rooms {
         if let Some(before) = &before {
             room.record(&state, || before.end());
             state.mixer.leave(before.session);
+        }
+        if claim.is_replay {
+            room.end_recording_of_replay(&mut state);
         }
         if state.is_recorded() {
             recorded(session).into_iter().for_each(|item| room.record(&state, || item));
@@ -471,6 +470,11 @@ pub(crate) struct Publishing {
 pub(crate) type Evicted = oneshot::Receiver<()>;
 
 impl Publishing {
+    /// What its place is taken back with.
+    pub fn resume(&self) -> Resume {
+        Resume { session: self.session, key: Some(self.key.to_string()) }
+    }
+
     /// Takes the source's newest face; where the source leads, the merged face becomes the room's newest state. False where another
     /// publisher has the slot. `message`, which the face was made of, is recorded, and behind it the packet.
     pub fn publish(&self, face: &FaceFrame, message: Option<Item>) -> bool {
@@ -554,6 +558,9 @@ impl Drop for Publishing {
             let publisher = state.publishers.remove(at);
             self.room.record(&state, || publisher.end());
             state.mixer.leave(self.session);
+            if !state.publishers.is_empty() {
+                self.room.end_recording_of_replay(&mut state);
+            }
             state.empty_since = Instant::now();
             self.room.metrics.publishers.dec();
         }

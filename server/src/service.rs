@@ -138,11 +138,7 @@ pub(crate) struct Hub {
 
 /// Begins a recording of `room`, which ends with the room or when it is told to. Done once its file is there.
 pub(crate) async fn record(hub: &Hub, room: &Room) -> Result<RecorderStatus, RecordError> {
-    if room.is_recorded() {
-        return Err(RecordError::Running);
-    }
-    let (sink, made) = hub.recorder.start(&room.name, room.since())?;
-    room.record_into(sink)?;
+    let made = room.record_with(&hub.recorder)?;
     // A disk may take its time to make a file.
     let made = tokio::task::spawn_blocking(move || made.recv()).await;
     if let Ok(Ok(Err(error))) = made {

@@ -8,7 +8,7 @@ use rhytid_shared::RoomName;
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
-use tokio::task::JoinHandle;
+use tokio::task::{AbortHandle, JoinSet};
 use tokio_tungstenite::tungstenite::Bytes;
 
 /// How often rooms are looked through, whatever is heard of them.
@@ -20,13 +20,16 @@ const ASK_SPACING: Duration = Duration::from_millis(100);
 
 /// Keeps the subscriptions what the viewers want.
 pub(super) async fn run(cluster: Arc<Cluster>, rooms: Weak<Rooms>) {
-    let mut feeds: HashMap<RoomName, JoinHandle<()>> = HashMap::new();
+    // They end with this: each holds its room, and with that a recording that is to be finished.
+    let mut tasks = JoinSet::new();
+    let mut feeds: HashMap<RoomName, AbortHandle> = HashMap::new();
     let mut interest = cluster.interest.subscribe();
     loop {
         // Only an end of the service makes it fail; then the task is stopped anyway.
         let _ = tokio::time::timeout(ROUND, interest.changed()).await;
         let Some(rooms) = rooms.upgrade() else { return };
         let watched = rooms.watched();
+        while tasks.try_join_next().is_some() {}
         feeds.retain(|room, feed| {
             let is_wanted = watched.contains_key(room) && !cluster.is_home(room) && !feed.is_finished();
             if !is_wanted {
@@ -36,7 +39,7 @@ pub(super) async fn run(cluster: Arc<Cluster>, rooms: Weak<Rooms>) {
         });
         for (name, room) in watched {
             if !feeds.contains_key(&name) && !cluster.is_home(&name) {
-                feeds.insert(name, tokio::spawn(feed(cluster.clone(), room)));
+                feeds.insert(name, tasks.spawn(feed(cluster.clone(), room)));
             }
         }
     }

@@ -13,18 +13,19 @@ pub(super) fn create(dir: &Path, room: &RoomName) -> Result<(File, PathBuf), Rec
     let time = stamp(SystemTime::now());
     for attempt in 1..100 {
         let suffix = if attempt == 1 { String::new() } else { format!("-{attempt}") };
-        let path = dir.join(format!("{room}-{time}{suffix}.mcap"));
+        let name = format!("{room}-{time}{suffix}.mcap");
+        let path = dir.join(&name);
         match OpenOptions::new().write(true).create_new(true).open(&path) {
             Ok(file) => {
                 hold(&file);
                 return Ok((file, path));
             }
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-            Err(source) => return Err(RecordError::Create { path: path.display().to_string(), source }),
+            Err(source) => return Err(RecordError::Create { file: name, source }),
         }
     }
     let source = io::ErrorKind::AlreadyExists.into();
-    Err(RecordError::Create { path: dir.join(format!("{room}-{time}.mcap")).display().to_string(), source })
+    Err(RecordError::Create { file: format!("{room}-{time}.mcap"), source })
 }
 
 /// Marks a recording's file as its holder's for as long as it is open there, also in clones of it; false where another holds it.

@@ -157,9 +157,10 @@ pub enum SessionEvent {
         /// Frames it gave.
         frames: u64,
     },
-    /// The disk was too slow: messages are missing here. Sessions that were running cannot be solved again from here on.
+    /// The disk was too slow, or who records as a viewer was without a connection: messages are missing here. Sessions
+    /// that were running cannot be solved again from here on.
     Gap {
-        /// How many.
+        /// How many; 0 where nobody knows.
         messages: u64,
     },
     /// The recording was ended.

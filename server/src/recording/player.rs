@@ -3,10 +3,11 @@
 
 use super::faces::{Faces, Moment};
 use super::files::room_of_file;
-use super::format::SessionEvent;
 use super::reader::{ReadError, Recording};
 use super::recorder::Item;
 use crate::config::seconds;
+use crate::lock::lock;
+use crate::publish::Rate;
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
 use rhytid_shared::{PublishHello, Resume, RoomName};
@@ -14,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::Semaphore;
 
@@ -28,6 +29,9 @@ const HOLD: Duration = Duration::from_millis(50);
 const LOOK: Duration = Duration::from_millis(100);
 /// Speeds that make sense; an infinite one sends everything at once.
 const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=100.0;
+/// Shortest session of a player: a jump, or a loop's beginning, waits until its session may begin. Each reads a chunk and takes one of
+/// the numbers that sessions have.
+const LEAST_SESSION: Duration = Duration::from_millis(50);
 /// Requests of one player that may wait for it: each jump takes it some milliseconds.
 const MOST_WAITING: usize = 64;
 /// Frames sent in a row at infinite speed before commands are looked at.
@@ -178,11 +182,7 @@ impl Default for Players {
 struct Handle {
     requests: SyncSender<PlayRequest>,
     status: Arc<Mutex<PlayStatus>>,
-}
-
-/// What stands under these locks is whole at each step.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+    session: Arc<Mutex<Resume>>,
 }
 
 impl Players {
@@ -279,10 +279,9 @@ impl Players {
         most_standing: Option<Duration>,
     ) -> Result<PlayStatus, PlayError> {
         let mut by_room = lock(&self.by_room);
-        // One of our own in this room makes place; others that have ended are forgotten.
-        let replaces = by_room.remove(room).is_some_and(|handle| lock(&handle.status).error.is_none());
-        by_room.retain(|_, handle| lock(&handle.status).error.is_none());
-        if by_room.len() >= MOST_PLAYERS {
+        // Those that have ended are forgotten. One of our own in this room makes place, once its place is ours.
+        by_room.retain(|name, handle| name == room || lock(&handle.status).error.is_none());
+        if by_room.keys().filter(|name| *name != room).count() >= MOST_PLAYERS {
             return Err(PlayError::TooMany);
         }
         let length = recording.seconds();
@@ -298,13 +297,19 @@ impl Players {
             to: request.to.unwrap_or(length).clamp(from, length),
             error: None,
         };
-        let place = Seat::take(hub, room, &source_of(&status.file), Hold { takeover: request.takeover || replaces, resume: None })?;
+        let place = {
+            // Its session, and no publisher's who has come meanwhile. Held, so that it does not begin another in this moment.
+            let before = by_room.get(room).map(|handle| lock(&handle.session));
+            let hold = Hold { takeover: request.takeover, resume: before.as_deref().cloned() };
+            Seat::take(hub, room, &source_of(&status.file), hold)?
+        };
+        let session = Arc::new(Mutex::new(place.place.resume()));
         let (requests, inbox) = sync_channel(MOST_WAITING);
         let shared = Arc::new(Mutex::new(status.clone()));
-        let handle = Handle { requests, status: shared.clone() };
+        let handle = Handle { requests, status: shared.clone(), session: session.clone() };
         let hub = hub.clone();
         let run = move || {
-            let mut player = Player::new(&hub, Faces::new(recording), place, status, most_standing);
+            let mut player = Player::new(&hub, Faces::new(recording), place, session, status, most_standing);
             let ended = player.run(&inbox, &shared);
             let mut status = lock(&shared);
             status.playing = false;
@@ -365,19 +370,7 @@ impl Seat {
     fn take(hub: &Hub, room: &RoomName, source: &str, hold: Hold) -> Result<Self, RoomError> {
         let claim =
             SlotClaim { source: source.to_owned(), takeover: hold.takeover, resume: hold.resume, is_replay: true, ..SlotClaim::default() };
-        let recorded = |session| {
-            let (slot, source) = (claim.slot.name.clone(), claim.source.clone());
-            // Its packets are recorded, and no messages that they could be solved from.
-            vec![Item::Event(SessionEvent::Start {
-                session,
-                slot,
-                source,
-                under_way: true,
-                kept_neutral: None,
-                profile: None,
-                solve: None,
-            })]
-        };
+        let recorded = |session| vec![Item::under_way(session, &claim.slot.name, &claim.source)];
         // Nobody commands it as they would a tracker.
         let (place, evicted) = hub.rooms.claim(room, claim.clone(), tokio::sync::mpsc::channel(1).0, recorded)?;
         Ok(Self { place, evicted })
@@ -390,9 +383,15 @@ struct Player<'a> {
     source: String,
     faces: Faces,
     seat: Seat,
+    /// The seat's, for who takes it over.
+    session: Arc<Mutex<Resume>>,
     has_lost_room: bool,
     num_frames: u32,
     status: PlayStatus,
+    /// Where to go, seconds, once another session may begin.
+    jump: Option<f64>,
+    /// As any publisher's: what is played faster leaves faces out.
+    rate: Rate,
     /// The next face's time; it stands in the reader.
     next: Option<Moment>,
     /// The face that is shown.
@@ -408,7 +407,14 @@ struct Player<'a> {
 }
 
 impl<'a> Player<'a> {
-    fn new(hub: &'a Hub, faces: Faces, seat: Seat, status: PlayStatus, most_standing: Option<Duration>) -> Self {
+    fn new(
+        hub: &'a Hub,
+        faces: Faces,
+        seat: Seat,
+        session: Arc<Mutex<Resume>>,
+        status: PlayStatus,
+        most_standing: Option<Duration>,
+    ) -> Self {
         let now = Instant::now();
         Self {
             hub,
@@ -417,8 +423,11 @@ impl<'a> Player<'a> {
             shown: faces.frame().clone(),
             faces,
             seat,
+            session,
             has_lost_room: false,
             num_frames: 0,
+            jump: None,
+            rate: Rate::new(hub.config.limits.frames_per_second, now.into()),
             next: None,
             anchor: (status.position, now),
             status,
@@ -437,12 +446,15 @@ impl<'a> Player<'a> {
             if self.status.speed.is_infinite() && self.status.playing {
                 due = Some(Instant::now());
             }
+            if self.jump.is_some() {
+                due = Some(self.begun + LEAST_SESSION);
+            }
             let wait =
                 due.map_or(HOLD, |due| due.saturating_duration_since(Instant::now())).min(if self.status.playing { LOOK } else { HOLD });
             match inbox.recv_timeout(wait) {
                 Ok(request) => {
                     self.stands_since = Instant::now();
-                    self.obey(&request)?;
+                    self.obey(&request);
                 }
                 Err(RecvTimeoutError::Disconnected) => return Ok("ended"),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -458,7 +470,13 @@ impl<'a> Player<'a> {
             } else if self.most_standing.is_some_and(|most| self.stands_since.elapsed() >= most) {
                 return Ok("it has stood still for too long");
             }
-            if self.status.playing {
+            if let Some(position) = self.jump {
+                if self.begun.elapsed() >= LEAST_SESSION {
+                    self.jump = None;
+                    self.renew();
+                    self.go_to(position)?;
+                }
+            } else if self.status.playing {
                 self.play()?;
             } else {
                 self.send(Instant::now());
@@ -489,8 +507,8 @@ impl<'a> Player<'a> {
             };
             if is_over {
                 if self.status.repeats && self.status.to > self.status.from {
-                    self.renew();
-                    return self.go_to(self.status.from);
+                    (self.jump, self.status.position) = (Some(self.status.from), self.status.from);
+                    return Ok(());
                 }
                 (self.status.playing, self.status.position) = (false, self.status.to);
                 return Ok(());
@@ -498,14 +516,16 @@ impl<'a> Player<'a> {
             let due = if self.status.speed.is_infinite() { Some(now) } else { self.due().filter(|due| *due <= now) };
             let (Some(next), Some(due)) = (self.next, due) else { return Ok(()) };
             self.shown.clone_from(self.faces.frame());
-            self.send(due);
+            if self.status.speed.is_infinite() || self.rate.take_if_free(due.into()) {
+                self.send(due);
+            }
             self.status.position = self.status.position.max(next.smooth);
             self.next = self.faces.advance()?;
         }
         Ok(())
     }
 
-    fn obey(&mut self, request: &PlayRequest) -> Result<(), ReadError> {
+    fn obey(&mut self, request: &PlayRequest) {
         let now = Instant::now();
         // From here on by the new speed.
         self.anchor = (self.status.position, now);
@@ -518,10 +538,10 @@ impl<'a> Player<'a> {
         self.status.playing = request.playing.unwrap_or(self.status.playing);
         let is_at_end = starts && request.position.is_none() && self.status.position >= self.status.to;
         if let Some(position) = request.position.or(is_at_end.then_some(self.status.from)) {
-            self.renew();
-            self.go_to(position.min(seconds))?;
+            let position = position.min(seconds);
+            // The last of several that come at once.
+            (self.jump, self.status.position) = (Some(position), position);
         }
-        Ok(())
     }
 
     /// Begins a session anew, unless another publisher has the room.
@@ -529,10 +549,11 @@ impl<'a> Player<'a> {
         if self.is_evicted() {
             return;
         }
-        let place = &self.seat.place;
-        let resume = Some(Resume { session: place.session, key: Some(place.key.to_string()) });
+        let mut session = lock(&self.session);
+        let resume = Some(session.clone());
         match Seat::take(self.hub, &self.room, &self.source, Hold { resume, ..Hold::default() }) {
             Ok(seat) => {
+                *session = seat.place.resume();
                 self.seat = seat;
                 self.num_frames = 0;
                 (self.begun, self.last_micros) = (Instant::now(), None);

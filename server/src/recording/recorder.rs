@@ -7,6 +7,7 @@
 use super::files::create;
 use super::format::{SessionEvent, VERSION};
 use super::writer::{RecordingWriter, nanos, unix_nanos};
+use crate::lock::lock;
 use crate::metrics::Metrics;
 use mcap::McapError;
 use rhytid_shared::packet::PacketLayout;
@@ -19,7 +20,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 use tokio_tungstenite::tungstenite::{Bytes, Utf8Bytes};
@@ -80,10 +81,10 @@ pub enum RecordError {
     #[error("the room is being recorded already")]
     Running,
     /// The file could not be made.
-    #[error("cannot make {path}: {source}")]
+    #[error("cannot make {file}: {source}")]
     Create {
-        /// The file.
-        path: String,
+        /// Its name: where the server keeps it is nobody's business.
+        file: String,
         /// What the system said.
         source: io::Error,
     },
@@ -123,6 +124,19 @@ pub(crate) enum Item {
 }
 
 impl Item {
+    /// The beginning of a session whose packets are recorded, and no messages that they could be solved from.
+    pub fn under_way(session: u32, slot: &str, source: &str) -> Self {
+        Self::Event(SessionEvent::Start {
+            session,
+            slot: slot.to_owned(),
+            source: source.to_owned(),
+            under_way: true,
+            kept_neutral: None,
+            profile: None,
+            solve: None,
+        })
+    }
+
     fn num_bytes(&self) -> usize {
         match self {
             // Hellos of characters and neutrals: a few KB, seldom.
@@ -224,7 +238,7 @@ impl Recorder {
                 Ok(()) => tracing::info!(file, "recording ended"),
                 Err(error) => {
                     metrics.recording_failures.inc();
-                    tracing::error!(file, error, "recording failed; the stream goes on");
+                    tracing::error!(file, folder = %folder.display(), error, "recording failed; the stream goes on");
                 }
             }
             let has_failed = ended.is_err();
@@ -238,18 +252,13 @@ impl Recorder {
             drop(keeps);
         };
         let thread = std::thread::Builder::new().name("recording".into());
-        thread.spawn(run).map_err(|source| RecordError::Create { path: "a thread".into(), source })?;
+        thread.spawn(run).map_err(|source| RecordError::Create { file: "a thread".into(), source })?;
         Ok((Arc::new(sink), is_made))
     }
 }
 
 /// Told once a recording's file is there, or why it is not.
 pub(crate) type Made = Receiver<Result<(), RecordError>>;
-
-/// What stands under these locks is whole at each step.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
 
 /// A place among the recordings at a time.
 struct Running {

@@ -6,7 +6,9 @@ use super::reader::{ReadError, Recording};
 use super::writer::RecordingWriter;
 use mcap::McapError;
 use rhytid_shared::packet::BatchReader;
+use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
+use std::io;
 use std::path::{Path, PathBuf};
 
 /// Why a recording could not be mended.
@@ -76,13 +78,11 @@ pub fn recover(path: &Path, out: Option<&Path>) -> Result<RecoverReport, Recover
         return Ok(report);
     }
     let broken = |problem: String| RecoverError::Write { path: target.display().to_string(), problem };
-    let mut options = OpenOptions::new();
-    match out {
-        Some(_) => options.create_new(true),
-        // A mending that was killed has left its own.
-        None => options.create(true).truncate(true),
-    };
-    let file = options.write(true).open(&target).map_err(|error| broken(error.to_string()))?;
+    if out.is_none() {
+        remove_left_over(&target).map_err(|error| broken(error.to_string()))?;
+    }
+    let file = OpenOptions::new().write(true).create_new(true).open(&target).map_err(|error| broken(error.to_string()))?;
+    hold(&file);
     let finished = copy(&mut recording, file, &mut report).map_err(|error| broken(error.to_string())).and_then(|()| {
         if out.is_some() {
             return Ok(());
@@ -101,16 +101,26 @@ pub fn recover(path: &Path, out: Option<&Path>) -> Result<RecoverReport, Recover
     Ok(report)
 }
 
+/// Where the mended file is made: hidden, and called as nobody would call a file of theirs.
 fn temporary(path: &Path) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".mended");
-    name.into()
+    let mut name = OsString::from(".");
+    name.push(path.file_name().unwrap_or_default());
+    name.push(".rhytid-mending");
+    path.with_file_name(name)
+}
+
+/// Removes what a mending that was killed has left at `path`: a plain file that nobody holds. Anything else stays, and stands in the
+/// way.
+fn remove_left_over(path: &Path) -> io::Result<()> {
+    // Of a link itself, not of what it leads to.
+    let is_plain = std::fs::symlink_metadata(path).is_ok_and(|found| found.is_file());
+    if is_plain && hold(&File::open(path)?) { std::fs::remove_file(path) } else { Ok(()) }
 }
 
 fn copy(recording: &mut Recording, file: File, report: &mut RecoverReport) -> Result<(), McapError> {
     let layout = recording.layout().clone();
     let handle = file.try_clone()?;
-    let mut writer = RecordingWriter::to(file, layout.clone()).map_err(|error| McapError::Io(std::io::Error::other(error)))?;
+    let mut writer = RecordingWriter::to(file, layout.clone()).map_err(|error| McapError::Io(io::Error::other(error)))?;
     let mut batches = BatchReader::new(layout);
     let (mut first, mut last) = (None, 0);
     for index in 0..recording.chunks().len() {

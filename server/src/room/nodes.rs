@@ -1,5 +1,6 @@
 //! Rooms among nodes: which of them is a room's home, what goes to the others and what comes from them.
 
+use super::recorded::ELSEWHERE_NOW;
 use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomError, RoomState, Rooms, lock};
 use crate::cluster::{Kept, Outlet, StateHead};
 use crate::framed::Framed;
@@ -129,7 +130,12 @@ impl Rooms {
     pub fn follow(&self, name: &RoomName, epoch: u64) {
         let Some(room) = self.find(name) else { return };
         let mut state = lock(&room.state);
-        if !state.is_home && state.epoch > epoch {
+        if state.is_home {
+            return;
+        }
+        // It may have moved while nobody published, which sent nobody away.
+        room.end_recording_by_itself(&mut state, ELSEWHERE_NOW);
+        if state.epoch > epoch {
             state.follow(epoch);
         }
     }
@@ -175,7 +181,7 @@ impl Rooms {
             // Its task may have ended in this moment.
             let _ = publisher.evict.send(());
         }
-        room.end_recording_by_itself(&mut state);
+        room.end_recording_by_itself(&mut state, ELSEWHERE_NOW);
         state.empty_since = Instant::now();
     }
 

@@ -1,7 +1,7 @@
 //! What recordings keep of a room.
 
 use super::{Publisher, Room, RoomState, Rooms, lock};
-use crate::recording::{Item, RecordError, RecorderStatus, SessionEvent, Sink};
+use crate::recording::{Item, Made, RecordError, Recorder, RecorderStatus, SessionEvent, Sink};
 use rhytid_shared::Slot;
 use std::sync::Arc;
 use std::time::Instant;
@@ -9,19 +9,9 @@ use tokio_tungstenite::tungstenite::Bytes;
 
 /// What sources at another node are called in a recording.
 const ELSEWHERE: &str = "another node";
-
-/// What a recording says of a session whose packets it has, and no messages that they could be solved from.
-fn under_way(session: u32, slot: &str, source: &str) -> Item {
-    Item::Event(SessionEvent::Start {
-        session,
-        slot: slot.to_owned(),
-        source: source.to_owned(),
-        under_way: true,
-        kept_neutral: None,
-        profile: None,
-        solve: None,
-    })
-}
+/// Why a recording that nobody asked for ends where its room has moved: the new home records it as this one did. One that somebody
+/// asked for goes on with the packets that come from there.
+pub(super) const ELSEWHERE_NOW: &str = "another node is the room's home now";
 
 impl Rooms {
     /// Begins the recording of a room that is recorded without being asked to. Waits for nothing.
@@ -71,12 +61,14 @@ impl Room {
         lock(&self.state).is_recorded()
     }
 
-    /// Records into `sink` from now on.
-    pub fn record_into(&self, sink: Arc<Sink>) -> Result<(), RecordError> {
+    /// Begins a recording that somebody has asked for. Waits for nothing: whether its file is there is told later.
+    pub fn record_with(&self, recorder: &Recorder) -> Result<Made, RecordError> {
         let mut state = lock(&self.state);
         if state.is_recorded() {
             return Err(RecordError::Running);
         }
+        // Under the lock: of two who ask at once, the second leaves no file.
+        let (sink, made) = recorder.start(&self.name, self.since)?;
         self.begin_recording(&mut state, sink);
         state.records_by_itself = false;
         drop(state);
@@ -84,17 +76,17 @@ impl Room {
             // Where its home is elsewhere, its packets are asked for.
             interest.send_replace(());
         }
-        Ok(())
+        Ok(made)
     }
 
     /// Sessions that are there are noted as under way, with the state that their packets refer to.
     fn begin_recording(&self, state: &mut RoomState, sink: Arc<Sink>) {
         for Publisher { session, claim, .. } in &state.publishers {
-            sink.put(self.nanos(), under_way(*session, &claim.slot.name, &claim.source));
+            sink.put(self.nanos(), Item::under_way(*session, &claim.slot.name, &claim.source));
         }
         let fed = state.fed.as_ref().filter(|_| !state.is_home).map(|fed| fed.frame.session);
         if let Some(session) = fed {
-            sink.put(self.nanos(), under_way(session, Slot::MAIN, ELSEWHERE));
+            sink.put(self.nanos(), Item::under_way(session, Slot::MAIN, ELSEWHERE));
         }
         if let Some(key) = state.key.as_ref().filter(|_| !state.publishers.is_empty() || fed.is_some()) {
             sink.put(self.nanos(), Item::Packet(key.framed.to_payload()));
@@ -105,13 +97,15 @@ impl Room {
 
     /// Records a packet of `session` that came from the room's home at another node, where the room is recorded.
     pub(super) fn record_fed(&self, state: &mut RoomState, session: u32, packet: Bytes) {
+        // Its lease may be heard of after its packets.
+        self.end_recording_by_itself(state, ELSEWHERE_NOW);
         if !state.is_recorded() {
             return;
         }
         let before = state.fed_session.filter(|(before, _)| *before == session);
         if before.is_none() {
             self.end_fed(state);
-            self.record(state, || under_way(session, Slot::MAIN, ELSEWHERE));
+            self.record(state, || Item::under_way(session, Slot::MAIN, ELSEWHERE));
         }
         self.record(state, || Item::Packet(packet));
         state.fed_session = Some((session, before.map_or(0, |(_, frames)| frames) + 1));
@@ -126,13 +120,20 @@ impl Room {
         }
     }
 
-    /// Ends a recording that nobody asked for: another node is the room's home now and records it as this one did. One that
-    /// somebody asked for goes on with the packets that come from there.
-    pub(super) fn end_recording_by_itself(&self, state: &mut RoomState) {
+    /// Ends a recording that nobody asked for.
+    pub(super) fn end_recording_by_itself(&self, state: &mut RoomState, reason: &str) {
         if state.records_by_itself
             && let Some(sink) = state.recording.take()
         {
-            sink.put(self.nanos(), Item::Event(SessionEvent::Stop { reason: "another node is the room's home now".into() }));
+            sink.put(self.nanos(), Item::Event(SessionEvent::Stop { reason: reason.into() }));
+        }
+    }
+
+    /// Ends a recording that nobody asked for where nobody but players is left: what is played is recorded only where somebody asks
+    /// for that.
+    pub(super) fn end_recording_of_replay(&self, state: &mut RoomState) {
+        if state.publishers.iter().all(|publisher| publisher.claim.is_replay) {
+            self.end_recording_by_itself(state, "a recording is played in the room");
         }
     }
 

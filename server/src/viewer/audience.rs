@@ -4,6 +4,7 @@
 //! that it holds into the cache. One task for all would keep a large room on one core.
 
 use super::member::{Counts, Member};
+use crate::lock::lock;
 use crate::room::{Latest, Room};
 use crate::service::Hub;
 use crate::socket::{Ending, Stop};
@@ -13,7 +14,7 @@ use std::collections::VecDeque;
 use std::future::poll_fn;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, Wake, Waker};
 use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
@@ -26,11 +27,6 @@ const GROUP: usize = 256;
 const STRETCH: usize = 32;
 /// A timer that is due at no time.
 const NEVER: Duration = Duration::from_secs(86_400);
-
-/// A lock that a panicking holder left is still whole: every change under it is one step.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
 
 /// All viewers of a room.
 #[derive(Default)]

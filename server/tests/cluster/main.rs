@@ -77,6 +77,14 @@ mod linux {
                 "recording_that_nobody_asked_for_ends_where_its_room_moves",
                 recordings::recording_that_nobody_asked_for_ends_where_its_room_moves,
             ),
+            trial(
+                "recording_that_nobody_asked_for_ends_where_its_empty_room_is_entered_elsewhere",
+                recordings::recording_that_nobody_asked_for_ends_where_its_empty_room_is_entered_elsewhere,
+            ),
+            trial(
+                "recording_of_another_nodes_room_is_finished_when_its_node_ends",
+                recordings::recording_of_another_nodes_room_is_finished_when_its_node_ends,
+            ),
             trial("password_and_certificates_of_nats_are_passed_through", admission::password_and_certificates),
             trial("node_at_all_addresses_is_to_say_which_one_others_tell", admission::advertised_address),
             trial("certificate_of_a_node_is_shown_to_nats", admission::own_certificate),

@@ -4,6 +4,7 @@ use super::http;
 use super::nats::Nats;
 use super::nodes::{HELLO, Node, Publisher};
 use super::process::wait_for;
+use super::signal::{Signal, signal};
 use super::watch::Watch;
 use rhytid_server::load_character;
 use rhytid_server::recording::{Faces, Recording, verify};
@@ -122,6 +123,46 @@ pub fn recording_that_nobody_asked_for_ends_where_its_room_moves() {
     let is_recording = |node: &Node| node.get("/metrics").unwrap().lines().any(|line| line == "rhytid_recordings 1");
     wait_for("the end of the first", || (!is_recording(&a)).then_some(()));
     assert!(is_recording(&b), "its home records it");
+}
+
+pub fn recording_that_nobody_asked_for_ends_where_its_empty_room_is_entered_elsewhere() {
+    let nats = Nats::start();
+    let recordings = [0, 1].map(|node| nats.folder.path().join(format!("recordings-{node}")));
+    recordings.iter().for_each(|folder| std::fs::create_dir_all(folder).unwrap());
+    let [a, b] = [0, 1].map(|node: usize| Node::with(&nats.url(), &["--record", recordings[node].to_str().unwrap()]).ready());
+    let mut first = a.publisher("demo", HELLO).ready();
+    publish(&mut first, 30);
+    drop(first);
+    // Longer than a node without a publisher stays a room's home.
+    std::thread::sleep(Duration::from_secs(4));
+    let mut second = b.publisher("demo", HELLO).ready();
+    publish(&mut second, 100);
+    let is_recording = |node: &Node| node.get("/metrics").unwrap().lines().any(|line| line == "rhytid_recordings 1");
+    wait_for("the end of the first", || (!is_recording(&a)).then_some(()));
+    assert!(is_recording(&b), "its home records it");
+    let file = std::fs::read_dir(&recordings[0]).unwrap().next().unwrap().unwrap().path();
+    let mut faces = Faces::new(Recording::open(&file).unwrap());
+    while faces.advance().unwrap().is_some() {
+        assert_eq!(faces.frame().session, 1, "what was published elsewhere is not in it");
+    }
+}
+
+pub fn recording_of_another_nodes_room_is_finished_when_its_node_ends() {
+    let nats = Nats::start();
+    let [mut a, b] = nodes(&nats);
+    let mut publisher = b.publisher("demo", HELLO).ready();
+    publisher.frame(0.1);
+    wait_for("the room's home", || a.room("demo"));
+    let (status, begun) = ask(&a, "POST", "/api/rooms/demo/record/start", "");
+    assert_eq!(status, 200, "{begun}");
+    publish(&mut publisher, 60);
+    signal(&a.process, Signal::TERM);
+    assert!(a.process.wait().unwrap().success());
+    a.kill();
+    assert!(!a.log().contains("did not close in time"), "nothing holds it up");
+    let file = begun["recording"]["file"].as_str().unwrap();
+    let recording = Recording::open(&nats.folder.path().join("recordings").join(file)).unwrap();
+    assert_eq!(recording.cut_off(), None, "it is finished");
 }
 
 fn publish(publisher: &mut Publisher, frames: u32) {

@@ -15,5 +15,7 @@ mod reader;
 mod server;
 #[path = "../process/signal.rs"]
 mod signal;
+#[path = "../process/socket.rs"]
+mod socket;
 mod solved_again;
 mod writer;

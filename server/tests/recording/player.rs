@@ -8,6 +8,7 @@ use rhytid_server::recording::{Faces, Recording, export_csv, export_gltf};
 use rhytid_shared::{TrackingData, TrackingFrame};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
+use tokio_tungstenite::tungstenite::Message;
 
 #[test]
 fn a_player_stops_seeks_and_goes_on() {
@@ -120,6 +121,83 @@ fn a_replay_that_stands_still_leaves_its_room_and_none_is_recorded_unasked() {
     served.json("POST", "/api/rooms/demo/replay", r#"{"file":"demo.mcap"}"#);
     served.json("POST", "/api/rooms/demo/record/start", "");
     assert_eq!(served.metric("rhytid_recordings"), 1.0);
+}
+
+#[test]
+fn a_replay_after_a_performance_is_not_recorded_unasked() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("played.mcap"), &character, &hello, &frames);
+    let served = Recorder::into(&folder);
+    let sending = served.keep_sending("1.0");
+    wait_until("its recording", || served.metric("rhytid_recordings") == 1.0 && served.metric("rhytid_frames_in_total") > 10.0);
+    drop(sending);
+    wait_until("its end", || served.json("GET", "/api/rooms", "")["rooms"][0]["publisher"].is_null());
+    assert_eq!(served.metric("rhytid_recordings"), 1.0, "who comes back soon is in the same recording");
+    served.json("POST", "/api/rooms/demo/replay", r#"{"file":"played.mcap","loop":true}"#);
+    wait_until("the performance's end", || served.metric("rhytid_recordings") == 0.0);
+    std::thread::sleep(Duration::from_millis(300));
+    assert_eq!((served.metric("rhytid_recordings"), folder.files().len()), (0.0, 2));
+    // The next performance is recorded again.
+    served.json("DELETE", "/api/rooms/demo/replay", "");
+    let _sending = served.keep_sending("1.0");
+    wait_until("the next recording", || served.metric("rhytid_recordings") == 1.0);
+}
+
+#[test]
+fn a_player_keeps_to_the_rates_of_publishers() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("demo.mcap"), &character, &hello, &frames);
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none", "--max-fps", "100"]);
+    let path = "/api/rooms/demo/replay";
+    let room = || served.json("GET", "/api/rooms", "")["rooms"][0].clone();
+    // 2,500 faces a second.
+    served.json("POST", path, r#"{"file":"demo.mcap","loop":true,"speed":100}"#);
+    wait_until("a face", || room()["frame"].is_object());
+    let watched = folder.path("watched.mcap");
+    let recorded = run(&["record", watched.to_str().unwrap(), "--server", &served.url(), "--seconds", "1"]);
+    assert!(recorded.status.success(), "{}", says(&recorded));
+    let mut faces = Faces::new(Recording::open(&watched).unwrap());
+    let mut num = 0;
+    while faces.advance().unwrap().is_some() {
+        num += 1;
+    }
+    assert!((30..150).contains(&num), "{num} faces in a second");
+    // A loop of a millisecond, and jumps all the time.
+    served.json("POST", path, r#"{"from":0,"to":0.001,"position":0}"#);
+    let before = room()["session"].as_u64().unwrap();
+    let start = std::time::Instant::now();
+    while start.elapsed() < Duration::from_secs(1) {
+        assert!([200, 503].contains(&served.request("POST", path, r#"{"position":0}"#).0));
+    }
+    let num = room()["session"].as_u64().unwrap() - before;
+    let most = start.elapsed().as_millis() as u64 / 50 + 2;
+    assert!((3..=most).contains(&num), "{num} sessions, {most} at most");
+}
+
+#[test]
+fn a_player_takes_its_forerunners_place_and_no_publishers() {
+    let folder = Folder::new();
+    let (character, _) = load_character(None).unwrap();
+    let (hello, frames) = resampled(&character, 25.0);
+    write_packets(&folder.path("demo.mcap"), &character, &hello, &frames);
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none"]);
+    let path = "/api/rooms/demo/replay";
+    for round in 0..5 {
+        // So slow that it looks after its room ten times a second.
+        assert_eq!(served.request("POST", path, r#"{"file":"demo.mcap","speed":0.01,"takeover":true}"#).0, 200);
+        let mut socket = crate::socket::open(&served.address, "demo/publish", &[], crate::process::PATIENCE).unwrap();
+        let hello = r#"{"type":"hello","version":1,"source":"test","fps":60,"takeover":true}"#;
+        socket.send(Message::text(hello)).unwrap();
+        let Message::Text(ready) = socket.read().unwrap() else { panic!("an answer") };
+        assert!(ready.contains("ready"), "{ready}");
+        let (status, answer) = served.request("POST", path, r#"{"file":"demo.mcap"}"#);
+        assert_eq!(status, 409, "round {round}: {answer}");
+        assert!(answer.contains("room_taken"), "{answer}");
+    }
 }
 
 #[test]

@@ -111,6 +111,37 @@ fn a_killed_server_leaves_recordings_that_verify() {
 }
 
 #[test]
+fn a_recording_that_cannot_be_made_says_why_and_not_where() {
+    let folder = Folder::new();
+    let takes = folder.path("takes");
+    std::fs::create_dir(&takes).unwrap();
+    let served = Recorder::start(&["serve", "--record", takes.to_str().unwrap(), "--record-rooms", "none"]);
+    std::fs::remove_dir(&takes).unwrap();
+    let (status, answer) = served.request("POST", "/api/rooms/demo/record/start", "");
+    assert_eq!(status, 500, "{answer}");
+    let told = served.request("GET", "/api/rooms", "").1;
+    for text in [answer, told] {
+        assert!(text.contains("cannot make demo-") && text.contains("No such file") && !text.contains(folder.shown()), "{text}");
+    }
+    wait_until("the folder in the log", || served.log().contains(folder.shown()));
+}
+
+#[test]
+fn of_two_who_begin_a_recording_at_once_one_leaves_a_file() {
+    let folder = Folder::new();
+    let served = Recorder::start(&["serve", "--record", folder.shown(), "--record-rooms", "none"]);
+    for room in 0..10 {
+        let path = format!("/api/rooms/room{room}/record/start");
+        let answers = std::thread::scope(|scope| {
+            let asking: Vec<_> = (0..8).map(|_| scope.spawn(|| served.request("POST", &path, "").0)).collect();
+            asking.into_iter().map(|asking| asking.join().unwrap()).collect::<Vec<_>>()
+        });
+        assert_eq!(answers.iter().filter(|status| **status == 200).count(), 1, "{answers:?}");
+    }
+    assert_eq!((folder.files().len(), served.metric("rhytid_recordings")), (10, 10.0));
+}
+
+#[test]
 fn a_full_disk_ends_the_recording_and_not_the_stream() {
     let folder = Folder::new();
     // 64 blocks of 512 or 1,024 bytes.
@@ -173,10 +204,20 @@ fn a_recording_is_not_mended_while_it_is_written_and_a_killed_mending_may_be_don
     assert!(std::fs::metadata(&path).unwrap().len() as f64 > before, "it is the file that is written");
     drop(served);
     drop(sending);
+    let name = path.file_name().unwrap().to_str().unwrap();
+    // Somebody's own, and where a mending makes its file a link to it.
+    let own = folder.path(&format!("{name}.mended"));
+    std::fs::write(&own, "mine").unwrap();
+    let left = folder.path(&format!(".{name}.rhytid-mending"));
+    std::os::unix::fs::symlink(&own, &left).unwrap();
+    let refused = run(&["recover", shown]);
+    assert!(!refused.status.success() && says(&refused).contains("cannot write"), "{}", says(&refused));
+    assert!(left.is_symlink());
+    std::fs::remove_file(&left).unwrap();
     // A mending that was killed has left this.
-    let left = folder.path(&format!("{}.mended", path.file_name().unwrap().to_str().unwrap()));
     std::fs::write(&left, vec![7; 100_000]).unwrap();
     let mended = run(&["recover", shown]);
+    assert_eq!(std::fs::read_to_string(&own).unwrap(), "mine");
     assert!(mended.status.success() && says(&mended).contains("kept "), "{}", says(&mended));
     assert!(!left.exists());
     let verified = run(&["verify", shown]);
