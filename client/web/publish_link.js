@@ -16,6 +16,11 @@ const MOST_WAITING = 48 << 10;
 /** How long an own session that broke off may still hold the room, milliseconds: the server's idle time and a little. */
 const OWN_GHOST = 20_000;
 
+/** Codes of errors that say who else has the slot, or the whole room at another node of a cluster. */
+const TAKEN = new Set(["room_taken", "slot_taken", "room_elsewhere"]);
+/** Codes of errors that another attempt may cure, by the same node or by another behind the same address. */
+const PASSING = new Set(["shutdown", "shutting_down", "cluster", "idle", "too_many_rooms", "too_many_connections", "hello_timeout"]);
+
 /** Milliseconds within which a connection must be answered. */
 const PATIENCE = 10_000;
 
@@ -37,8 +42,8 @@ export class PublishLink {
     this.socket = null;
     this.timer = 0;
     this.wasReadyAt = -Infinity;
-    /** Number of the last session that was ready: who comes back takes its own slot back with it. */
-    this.session = 0;
+    /** Of the last session that was ready its number and key: who comes back takes its own slot back with them. */
+    this.own = { resume: 0 };
     this.numFrames = 0;
     this.numSkipped = 0;
     this.bytes = 0;
@@ -75,7 +80,7 @@ export class PublishLink {
     socket.onopen = () => {
       wasOpen = true;
       const again = this.wasReadyAt > -Infinity;
-      const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true, resume: this.session } : {}) };
+      const hello = { type: "hello", version: 1, ...this.hello(), takeover, ...(again ? { keep_neutral: true, ...this.own } : {}) };
       socket.send(JSON.stringify(hello));
     };
     const tooLate = setTimeout(() => socket.close(), PATIENCE);
@@ -92,7 +97,7 @@ export class PublishLink {
       if (message.type === "ready") {
         this.backoff.reset();
         this.wasReadyAt = performance.now();
-        this.session = message.session;
+        this.own = { resume: message.session, resume_key: message.resume_key };
         this.#become("ready", "");
       }
       this.questions.heard(message);
@@ -116,11 +121,11 @@ export class PublishLink {
 
   /** @param {{code: string, message: string}} last */
   #ended({ code, message }) {
-    const isTaken = code === "room_taken" || code === "slot_taken";
+    const isTaken = TAKEN.has(code);
     const mayBeOwnGhost = performance.now() - this.wasReadyAt < OWN_GHOST;
     if (code === "taken_over" || (isTaken && !mayBeOwnGhost)) {
       this.#become("taken", message);
-    } else if (code && !isTaken && !["shutdown", "idle", "too_many_rooms", "too_many_connections", "hello_timeout"].includes(code)) {
+    } else if (code && !isTaken && !PASSING.has(code)) {
       this.#become("refused", message);
       if (isAboutToken(code)) {
         askForToken(message);

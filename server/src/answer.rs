@@ -15,6 +15,8 @@ pub(crate) enum Answer<'a> {
         room: &'a str,
         /// Number of this session in its room.
         session: u32,
+        /// What the publisher proves with that this session was its own, when it comes back.
+        resume_key: &'a str,
         /// True where the session starts from the neutral face that the room has kept.
         kept_neutral: bool,
         character: &'a str,

@@ -44,10 +44,15 @@ const REQUEST_TIMEOUT: Duration = Duration::from_millis(300);
 const BUCKET_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long a start waits for NATS: a publisher that comes in the first moment would else find a node that is on its own.
 const FIRST_JOIN: Duration = Duration::from_secs(2);
+/// How often a node looks whether NATS still keeps records: servers that have lost too many of their own kind answer all else.
+const RECORDS_ROUND: Duration = Duration::from_secs(2);
 /// How long the others may take to find NATS again when it is back: until then who does not answer may live.
 const GATHERING: Duration = Duration::from_secs(3);
 /// Records that wait to be kept: one for each slot of a thousand rooms.
 const MOST_KEEPING: usize = 8192;
+/// How often a record is offered to a NATS that is there and does not take it: for ten seconds, in which its servers may choose who
+/// leads them.
+const MOST_KEEPING_TRIES: u32 = 20;
 /// Records that are sent to be kept at a time.
 const KEEPING_AT_ONCE: usize = 16;
 /// How often a node tells of itself and looks after its leases.
@@ -198,6 +203,15 @@ impl Keeping {
         true
     }
 
+    /// Puts back what could not be kept, unless there is something newer.
+    fn put_back(&self, key: String, value: Bytes) {
+        let mut waiting = lock(&self.waiting);
+        if waiting.len() < MOST_KEEPING {
+            waiting.entry(key).or_insert(value);
+            self.is_there.notify_one();
+        }
+    }
+
     fn take_now(&self) -> HashMap<String, Bytes> {
         std::mem::take(&mut *lock(&self.waiting))
     }
@@ -236,6 +250,8 @@ pub(crate) struct Cluster {
     connections: Arc<Connections>,
     /// Which connection the buckets and leases have been looked at through, and since when.
     joined: watch::Sender<(u64, Instant)>,
+    /// Why NATS keeps no records, where that is so.
+    lack: Mutex<Option<String>>,
     started: Instant,
     node: String,
     address: String,
@@ -330,6 +346,7 @@ impl Cluster {
             client,
             connections,
             joined: watch::Sender::new((0, Instant::now())),
+            lack: Mutex::default(),
             started: Instant::now(),
             outbound: Mutex::new(Some(outbound)),
             outlet: Outlet { prefix: prefix.clone(), outbound: outlet },
@@ -360,12 +377,33 @@ impl Cluster {
     }
 
     /// Why the node is on its own, if so.
-    pub fn problem(&self) -> Option<&'static str> {
-        match self.client.connection_state() {
-            State::Connected if self.is_cut.load(Ordering::SeqCst) => Some("NATS does not answer"),
-            State::Connected if self.joined.borrow().0 == self.connection() => None,
-            State::Connected => Some("NATS has no JetStream yet"),
-            _ => Some("NATS is not reached"),
+    pub fn problem(&self) -> Option<String> {
+        let words = match self.client.connection_state() {
+            State::Connected if self.is_cut.load(Ordering::SeqCst) => "NATS does not answer",
+            State::Connected => match &*lock(&self.lack) {
+                Some(lack) => return Some(format!("NATS keeps no records: {lack}")),
+                None if self.joined.borrow().0 == self.connection() => return None,
+                None => "NATS has no JetStream yet",
+            },
+            _ => "NATS is not reached",
+        };
+        Some(words.to_owned())
+    }
+
+    /// Other nodes can be asked, as far as is known.
+    fn can_talk(&self) -> bool {
+        self.client.connection_state() == State::Connected && !self.is_cut.load(Ordering::SeqCst)
+    }
+
+    /// Notes why NATS keeps no records, or that it does.
+    fn note_lack(&self, lack: Option<String>) {
+        let mut noted = lock(&self.lack);
+        if *noted != lack {
+            match &lack {
+                Some(lack) => tracing::warn!(lack, "NATS keeps no records: this node's own rooms go on"),
+                None => tracing::info!("NATS keeps records again"),
+            }
+            *noted = lack;
         }
     }
 
@@ -422,6 +460,7 @@ impl Cluster {
         tasks.spawn(self.clone().answer(rooms.clone()));
         tasks.spawn(self.clone().hear_of_nodes(rooms.clone()));
         tasks.spawn(self.clone().look_after(rooms.clone()));
+        tasks.spawn(self.clone().look_at_records());
         tasks.spawn(feed::run(self.clone(), rooms));
         // Not cut off in the middle of what it has taken.
         tokio::spawn(self.clone().keep_all(shutdown.clone()));
@@ -474,8 +513,7 @@ impl Cluster {
     fn let_go(&self, rooms: &Rooms, question: &EnterQuestion) -> EnterAnswer {
         let Ok(room) = RoomName::new(&question.room) else { return EnterAnswer::default() };
         let slots = rooms.slots(&room);
-        let is_the_one = |&(_, session): &(String, u32)| question.resume == Some(session);
-        let is_granted = question.takeover || slots.iter().all(is_the_one);
+        let is_granted = question.takeover || rooms.is_free_for(&room, question.resume().as_ref());
         if is_granted {
             lock(&self.held).remove(&room);
             rooms.evict(&room, None);
@@ -534,17 +572,14 @@ impl Cluster {
                 self.unheard.store(0, Ordering::SeqCst);
                 self.is_cut.store(false, Ordering::SeqCst);
                 // Also where they were there before: NATS may have come back without them.
-                match tokio::time::timeout(BUCKET_TIMEOUT, self.make_buckets()).await {
-                    Ok(Ok(buckets)) => drop(self.buckets.set(buckets)),
-                    Ok(Err(problem)) => {
-                        tracing::warn!(problem, "JetStream is not to be had");
-                        continue;
-                    }
-                    Err(_) => {
-                        tracing::warn!("JetStream does not answer");
+                match self.make_buckets_in_time(&rooms).await {
+                    Ok(buckets) => drop(self.buckets.set(buckets)),
+                    Err(lack) => {
+                        self.note_lack(Some(lack));
                         continue;
                     }
                 }
+                self.note_lack(None);
                 // What it has of them may be older than what is held.
                 lock(&self.held).values_mut().for_each(|held| held.revision = None);
             }
@@ -555,7 +590,7 @@ impl Cluster {
             if is_new {
                 self.joined.send_replace((connection, Instant::now()));
                 self.homes.send_replace(());
-                tracing::info!(node = self.node, "joined the cluster");
+                tracing::info!(node = self.node, server = self.client.server_info().server_name, "joined the cluster");
             }
             if self.unheard.fetch_add(1, Ordering::SeqCst) >= DEAF {
                 self.unheard.store(0, Ordering::SeqCst);
@@ -575,6 +610,51 @@ impl Cluster {
             // Not for longer than a round, where nothing can be sent.
             let _ = tokio::time::timeout(ROUND, self.tell(&rooms)).await;
         }
+    }
+
+    /// Every so often: whether NATS keeps what it is given. A majority of its servers may be gone while this one's goes on.
+    async fn look_at_records(self: Arc<Self>) {
+        let mut round = tokio::time::interval(RECORDS_ROUND);
+        round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut num_missed = 0;
+        loop {
+            round.tick().await;
+            let connection = self.joined.borrow().0;
+            let stands = || connection == self.connection() && self.client.connection_state() == State::Connected;
+            let Some(buckets) = self.buckets.get().filter(|_| stands()) else { continue };
+            let looked = match buckets.leases.stream.get_info().await {
+                // Servers that have no leader answer with what each of them knows.
+                Ok(info) if info.cluster.as_ref().is_some_and(|cluster| cluster.leader.as_ref().is_none_or(String::is_empty)) => {
+                    Err(LEADERLESS.to_owned())
+                }
+                Ok(_) => Ok(()),
+                Err(error) => Err(told_by(&error)),
+            };
+            num_missed = if looked.is_ok() { 0 } else { num_missed + 1 };
+            // One that is slow once is not gone; and of another connection than the one that stands it says nothing.
+            if stands() && num_missed != 1 {
+                self.note_lack(looked.err());
+            }
+        }
+    }
+
+    /// The buckets, or why they are not to be had. Meanwhile other nodes are told of this one: what it shows of their rooms and they
+    /// of its own needs no records.
+    async fn make_buckets_in_time(&self, rooms: &Rooms) -> Result<Buckets, String> {
+        let making = tokio::time::timeout(BUCKET_TIMEOUT, self.make_buckets());
+        tokio::pin!(making);
+        let made = loop {
+            tokio::select! {
+                made = making.as_mut() => break made,
+                () = tokio::time::sleep(ROUND) => drop(tokio::time::timeout(ROUND, self.tell(rooms)).await),
+            }
+        };
+        if !matches!(made, Ok(Ok(_))) {
+            // Not for longer than a round, where nothing can be sent.
+            let _ = tokio::time::timeout(ROUND, self.tell(rooms)).await;
+        }
+        let replicas = if self.replicas > 1 { format!(" (--cluster-replicas {})", self.replicas) } else { String::new() };
+        made.unwrap_or_else(|_| Err(UNANSWERED.to_owned())).map_err(|lack| lack + &replicas)
     }
 
     /// Tells other nodes of this one's rooms.
@@ -613,8 +693,12 @@ impl Cluster {
                 allow_direct: true,
                 ..stream::Config::default()
             };
-            jetstream.get_or_create_stream(config).await.map_err(|error| error.to_string())?;
-            jetstream.get_key_value(bucket).await.map_err(|error| error.to_string())
+            let stream = jetstream.get_or_create_stream(config).await.map_err(|error| told_by(&error))?;
+            let num_replicas = stream.cached_info().config.num_replicas;
+            if num_replicas != self.replicas {
+                tracing::warn!(bucket, num_replicas, wanted = self.replicas, "the bucket is there already: `nats stream edit` changes it");
+            }
+            jetstream.get_key_value(bucket).await.map_err(|error| told_by(&error))
         };
         Ok(Buckets {
             leases: make("leases", MOST_LEASE_BYTES, ALL_LEASE_BYTES).await?,
@@ -637,36 +721,80 @@ impl Cluster {
         }
     }
 
-    /// Keeps what there is to keep until the service ends.
+    /// Keeps what there is to keep until the service ends. What NATS does not take is tried again, unless something newer has come.
     async fn keep_all(self: Arc<Self>, mut shutdown: watch::Receiver<bool>) {
+        let mut tries: HashMap<String, u32> = HashMap::new();
         loop {
             let taken = tokio::select! {
                 taken = self.keeping.take() => taken,
                 () = stopped(&mut shutdown) => return,
             };
-            self.keep_these(taken).await;
+            let refused = self.keep_these(taken).await;
+            tries.retain(|key, _| refused.iter().any(|(refused, ..)| refused == key));
+            for (key, text, problem) in refused {
+                let num_tries = tries.entry(key.clone()).or_default();
+                // Without NATS it waits for as long as that takes.
+                *num_tries += u32::from(self.problem().is_none());
+                if *num_tries >= MOST_KEEPING_TRIES {
+                    tracing::warn!(key, problem, "neutral face not kept in the cluster");
+                    tries.remove(&key);
+                } else {
+                    tracing::debug!(key, problem, "neutral face not kept in the cluster yet");
+                    self.keeping.put_back(key, text);
+                }
+            }
+            if !tries.is_empty() {
+                tokio::select! {
+                    () = tokio::time::sleep(ROUND) => {}
+                    () = stopped(&mut shutdown) => return,
+                }
+            }
         }
     }
 
     /// Keeps what publishers have left in the last moment.
     pub async fn keep_rest(&self) {
         // Without NATS each would wait for its own time.
-        let _ = tokio::time::timeout(Duration::from_secs(1), self.keep_these(self.keeping.take_now())).await;
-    }
-
-    /// Done with all of them, so that the next value of any key comes behind them.
-    async fn keep_these(&self, taken: HashMap<String, Bytes>) {
-        if let Some(buckets) = self.buckets.get() {
-            let puts = taken.into_iter().map(async |(key, text)| {
-                match tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.put(&key, text)).await {
-                    Ok(Ok(_)) => {}
-                    Ok(Err(error)) => tracing::warn!(key, %error, "neutral face not kept in the cluster"),
-                    Err(_) => tracing::warn!(key, "neutral face not kept in the cluster: no answer"),
-                }
-            });
-            futures_util::stream::iter(puts).buffer_unordered(KEEPING_AT_ONCE).collect::<()>().await;
+        let keeping = tokio::time::timeout(Duration::from_secs(1), self.keep_these(self.keeping.take_now())).await;
+        for (key, _, problem) in keeping.unwrap_or_default() {
+            tracing::warn!(key, problem, "neutral face not kept in the cluster");
         }
     }
+
+    /// Done with all of them, so that the next value of any key comes behind them. Gives those that were not taken, and why.
+    async fn keep_these(&self, taken: HashMap<String, Bytes>) -> Vec<(String, Bytes, String)> {
+        let Some(buckets) = self.buckets.get() else {
+            return taken.into_iter().map(|(key, text)| (key, text, "there is no bucket yet".to_owned())).collect();
+        };
+        let puts = taken.into_iter().map(async |(key, text)| {
+            let problem = match tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.put(&key, text.clone())).await {
+                Ok(Ok(_)) => return None,
+                Ok(Err(error)) => error.to_string(),
+                Err(_) => "no answer".to_owned(),
+            };
+            Some((key, text, problem))
+        });
+        let puts = futures_util::stream::iter(puts).buffer_unordered(KEEPING_AT_ONCE);
+        puts.filter_map(std::future::ready).collect().await
+    }
+}
+
+/// JetStream's servers are choosing who leads them, or have no majority for that.
+const UNANSWERED: &str = "JetStream does not answer: too few of its servers may be there";
+const LEADERLESS: &str = "JetStream has no leader: too few of its servers may be there";
+
+/// What an error of JetStream's says, and what is behind it.
+fn told_by(error: &dyn std::error::Error) -> String {
+    let mut told = error.to_string();
+    let mut behind = error.source();
+    while let Some(error) = behind {
+        let more = error.to_string();
+        if !told.contains(&more) {
+            told = format!("{told}: {more}");
+        }
+        behind = error.source();
+    }
+    if told.contains("timed out") { UNANSWERED.to_owned() } else { told }
 }
 
 /// An id that no other start has: 64 random bits from the standard library's own source.
@@ -717,6 +845,10 @@ mod tests {
             assert!(keeping.put(key.into(), value.into()));
         }
         assert_eq!(keeping.take().await, HashMap::from([("a".into(), "3".into()), ("b".into(), "2".into())]));
+        assert!(keeping.put("a".into(), "4".into()));
+        keeping.put_back("a".into(), "3".into());
+        keeping.put_back("b".into(), "2".into());
+        assert_eq!(keeping.take().await, HashMap::from([("a".into(), "4".into()), ("b".into(), "2".into())]));
         assert!((0..MOST_KEEPING).all(|k| keeping.put(k.to_string(), Bytes::new())));
         assert!(!keeping.put("one more".into(), Bytes::new()) && keeping.put("7".into(), "new".into()));
     }

@@ -132,6 +132,7 @@ impl<'a> Session<'a> {
             version: PROTOCOL_VERSION,
             room: self.source.room().as_str(),
             session: self.source.session(),
+            resume_key: self.source.resume_key(),
             kept_neutral: self.source.kept_neutral,
             character: &character.name,
             bones: character.bones.iter().map(|bone| bone.name.as_str()).collect(),
@@ -279,6 +280,8 @@ fn not_opened(error: OpenError) -> Stop {
 fn not_entered(error: LeaseError) -> Stop {
     match error {
         LeaseError::Room(error) => not_opened(error.into()),
+        // As for those who are in already: it is no fault of theirs, and another node takes them.
+        LeaseError::Leaving => Ending::shutdown().into(),
         error => refusal(error.code(), error.to_string()),
     }
 }

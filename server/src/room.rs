@@ -10,10 +10,11 @@ use crate::metrics::Metrics;
 use crate::recording::{Item, Recorder, SessionEvent, Sink};
 use crate::solve::mix::Mixer;
 use crate::source::Control;
+use crate::token::random_key;
 use crate::viewer::Audience;
 use rhytid_shared::packet::{Decoder, Encoder, PacketKind, PacketLayout};
 use rhytid_shared::view::{CharacterHello, JsonFrame, ViewMessage};
-use rhytid_shared::{Character, FaceFrame, PublishHello, RoomName, Slot};
+use rhytid_shared::{Character, FaceFrame, PublishHello, Resume, RoomName, Slot};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::{Duration, Instant};
@@ -103,7 +104,7 @@ pub(crate) struct SlotClaim {
     /// Take the slot over from another publisher.
     pub takeover: bool,
     /// Take it over from this session, which was the claimant's own.
-    pub resume: Option<u32>,
+    pub resume: Option<Resume>,
     /// It plays a recording: no other one is made of that unless somebody asks for it.
     pub is_replay: bool,
 }
@@ -112,7 +113,7 @@ impl SlotClaim {
     /// As a hello says it.
     pub fn of(hello: &PublishHello) -> Self {
         let PublishHello { slot, source, takeover, resume, .. } = hello;
-        Self { slot: slot.clone(), source: source.clone(), takeover: *takeover, resume: *resume, is_replay: false }
+        Self { slot: slot.clone(), source: source.clone(), takeover: *takeover, resume: resume.clone(), is_replay: false }
     }
 }
 
@@ -191,6 +192,8 @@ struct Neutral {
 
 struct Publisher {
     session: u32,
+    /// Nobody but this publisher is told it.
+    key: Arc<str>,
     claim: SlotClaim,
     since: Instant,
     /// Frames that the room has taken.
@@ -214,6 +217,14 @@ impl Eras {
         self.count += u64::from(session.wrapping_sub(self.session).cast_signed() < 0);
         self.session = session;
         self.count
+    }
+}
+
+impl Publisher {
+    /// It is the session that a claimant had. Its number alone says so where it is not used again: a cluster counts on, but a server
+    /// without one begins at 1 each time that it is started.
+    fn is_of(&self, resume: Option<&Resume>, counts_on: bool) -> bool {
+        resume.is_some_and(|Resume { session, key }| *session == self.session && key.as_deref().map_or(counts_on, |key| *key == *self.key))
     }
 }
 
@@ -271,7 +282,7 @@ impl Rooms {
         }
         let before = state.publishers.iter().position(|publisher| publisher.claim.slot.name == claim.slot.name);
         match before {
-            Some(at) if !claim.takeover && claim.resume != Some(state.publishers[at].session) => {
+            Some(at) if !claim.takeover && !state.publishers[at].is_of(claim.resume.as_ref(), self.others.is_some()) => {
                 return Err(if claim.slot.name == Slot::MAIN { RoomError::Taken } else { RoomError::SlotTaken });
             }
             None if state.publishers.len() >= MAX_SLOTS => return Err(RoomError::TooManySlots { most: MAX_SLOTS }),
@@ -292,7 +303,8 @@ impl Rooms {
             recorded(session).into_iter().for_each(|item| room.record(&state, || item));
         }
         state.mixer.enter(session, &claim.slot);
-        state.publishers.push(Publisher { session, claim, since: Instant::now(), num_frames: 0, evict, controls });
+        let key = random_key();
+        state.publishers.push(Publisher { session, key: key.clone(), claim, since: Instant::now(), num_frames: 0, evict, controls });
         drop(state);
         if let Some(before) = before {
             // Its task may have ended in this moment; then nobody needs to be told.
@@ -300,7 +312,7 @@ impl Rooms {
         } else {
             self.metrics.publishers.inc();
         }
-        Ok((Publishing { room, session }, evicted))
+        Ok((Publishing { room, session, key }, evicted))
     }
 
     /// The room, made where there is none.
@@ -449,6 +461,8 @@ pub(crate) struct Publishing {
     pub room: Arc<Room>,
     /// Number of this session in its room, from 1.
     pub session: u32,
+    /// What proves that a publisher which comes back had this session.
+    pub key: Arc<str>,
 }
 
 /// Done when another publisher has taken the place.

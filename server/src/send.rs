@@ -235,9 +235,7 @@ enum Ending {
 #[derive(Debug, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 enum Answer {
-    Ready {
-        session: u32,
-    },
+    Ready(Begun),
     Calibrated {
         t: f64,
     },
@@ -247,6 +245,14 @@ enum Answer {
     },
     #[serde(other)]
     Unknown,
+}
+
+/// A session that a server has begun.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+struct Begun {
+    session: u32,
+    /// What proves that it was this sender's.
+    resume_key: Option<String>,
 }
 
 pub(crate) type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
@@ -260,7 +266,7 @@ struct Journey {
     /// Which of the servers is asked.
     at: usize,
     /// The session that was begun last.
-    session: Option<u32>,
+    session: Option<Begun>,
     /// When the feed began, and its time then.
     clock: Option<(Instant, f64)>,
 }
@@ -291,7 +297,7 @@ async fn send_once<R: BufRead>(
     let mut since = Instant::now();
     let mut num_in_vain = 0;
     loop {
-        let session = journey.session;
+        let session = journey.session.clone();
         let over = Over { server: servers[journey.at], is_of_many: servers.len() > 1, options, progress };
         let lost = match over.send(&mut feed, &mut journey, report, stop.as_mut()).await {
             Ok(ending) => return Ok(ending),
@@ -352,7 +358,7 @@ impl Over<'_> {
         };
         // At full speed a server may have much to read before it comes to a ping.
         let is_watched = self.is_of_many && options.speed.is_finite();
-        let begun = journey.session;
+        let begun = journey.session.clone();
 
         let ending = tokio::select! {
             // An end of the listening says more than that a message did not get through.
@@ -401,7 +407,7 @@ impl Over<'_> {
         &self,
         feed: &mut Feed<R>,
         sink: &mut Sink,
-        is_ready: oneshot::Receiver<u32>,
+        is_ready: oneshot::Receiver<Begun>,
         heard: &Mutex<Instant>,
         journey: &mut Journey,
         report: &mut SendReport,
@@ -413,7 +419,7 @@ impl Over<'_> {
             Ok(Err(_)) => Err(Unsent::Lost),
             Err(_) => Err(within("it read nothing", options.timeout)),
         };
-        write(Message::text(hello(&journey.hello, options, journey.session))).await?;
+        write(Message::text(hello(&journey.hello, options, journey.session.as_ref()))).await?;
         let patience = if self.is_of_many { options.timeout.min(ENTER_TIMEOUT) } else { options.timeout };
         // The server reads nothing while it finds out whether the publisher may come in.
         set(heard, Instant::now() + patience);
@@ -542,7 +548,7 @@ struct End {
 }
 
 /// Shows the server's answers until it closes.
-async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sender<u32>, heard: Arc<Mutex<Instant>>) -> End {
+async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sender<Begun>, heard: Arc<Mutex<Instant>>) -> End {
     let mut ready = Some(ready);
     let mut errors = 0;
     let mut last_error = None;
@@ -551,10 +557,10 @@ async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sen
         set(&heard, Instant::now());
         match message {
             Ok(Message::Text(text)) => match serde_json::from_str(&text) {
-                Ok(Answer::Ready { session }) => {
-                    tracing::info!(session, "ready");
+                Ok(Answer::Ready(begun)) => {
+                    tracing::info!(session = begun.session, "ready");
                     // The sender may have given up in this moment.
-                    let _ = ready.take().map(|ready| ready.send(session));
+                    let _ = ready.take().map(|ready| ready.send(begun));
                 }
                 Ok(Answer::Calibrated { t }) => tracing::info!(t, "calibrated"),
                 Ok(Answer::Error { code, message }) if code == "too_fast" => tracing::info!(message),
@@ -586,13 +592,16 @@ async fn listen(mut answers: Answers, progress: ProgressBar, ready: oneshot::Sen
 }
 
 /// The feed's hello, with what the options add to it, or as that of one who comes back from `session`.
-fn hello(line: &str, options: &SendOptions, session: Option<u32>) -> String {
+fn hello(line: &str, options: &SendOptions, session: Option<&Begun>) -> String {
     if !options.takeover && options.profile.is_none() && options.slot.is_none() && options.priority.is_none() && session.is_none() {
         return line.to_owned();
     }
     let Ok(mut fields) = serde_json::from_str::<serde_json::Map<String, serde_json::Value>>(line) else { return line.to_owned() };
-    if let Some(session) = session {
-        fields.insert("resume".into(), session.into());
+    if let Some(Begun { session, resume_key }) = session {
+        fields.insert("resume".into(), (*session).into());
+        if let Some(key) = resume_key {
+            fields.insert("resume_key".into(), key.as_str().into());
+        }
         fields.insert("keep_neutral".into(), true.into());
     } else if options.takeover {
         fields.insert("takeover".into(), true.into());

@@ -461,6 +461,11 @@ impl Source {
         self.profile.as_ref().map(|profile| profile.name.as_str()).filter(|name| !name.is_empty())
     }
 
+    /// What its publisher takes its slot back with, beside the session's number.
+    pub fn resume_key(&self) -> &str {
+        &self.place.key
+    }
+
     /// Number of this session in its room, from 1.
     pub fn session(&self) -> u32 {
         self.place.session

@@ -339,6 +339,13 @@ impl JwtVerifier for Hs256 {
     }
 }
 
+/// 128 random bits as text, for what nobody shall guess.
+pub(crate) fn random_key() -> Arc<str> {
+    let mut key = [0; 16];
+    SystemRandom::new().fill(&mut key).expect("the system has random numbers");
+    format!("{:032x}", u128::from_le_bytes(key)).into()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

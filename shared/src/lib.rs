@@ -21,7 +21,7 @@ pub use face::{FaceFrame, HeadPose};
 pub use names::{ARKIT_NAMES, ArkitShape, NUM_ARKIT_SHAPES, NameError, RoomName};
 pub use tracking::{
     Calibration, ChannelGroup, ChannelGroups, Command, FIT_SECONDS, FaceKind, FitRequest, FitStep, GroupValues, MessageError,
-    PROFILE_VERSION, Profile, ProfileChoice, PublishHello, PublishMessage, PublishReader, RANGE_FACTORS, Ranges, Settings, Slot,
+    PROFILE_VERSION, Profile, ProfileChoice, PublishHello, PublishMessage, PublishReader, RANGE_FACTORS, Ranges, Resume, Settings, Slot,
     TrackingData, TrackingFrame, encode_landmarks,
 };
 

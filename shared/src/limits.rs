@@ -38,6 +38,8 @@ pub const MAX_IMAGES: usize = 64;
 pub const MAX_TEXELS: u64 = 4 * (MAX_TEXTURE_SIDE as u64) * (MAX_TEXTURE_SIDE as u64);
 /// Largest message on a publish socket, bytes: 478 points with z and confidence as JSON take 35 KB.
 pub const MAX_MESSAGE_BYTES: usize = 256 << 10;
+/// Longest key of a session, bytes; the server's have 32.
+pub const MAX_RESUME_KEY: usize = 64;
 /// Largest time on a sender's clock, seconds: the Unix clock stays below it for two centuries, and microseconds of it
 /// are whole numbers in an `f64`.
 pub const MAX_SECONDS: f64 = 9e9;

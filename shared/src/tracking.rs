@@ -39,7 +39,7 @@ pub struct PublishHello {
     /// Take the slot over from another publisher.
     pub takeover: bool,
     /// Take the slot over from this session, which was the publisher's own until its connection broke, with everything as it was.
-    pub resume: Option<u32>,
+    pub resume: Option<Resume>,
     /// The source slot that it claims.
     pub slot: Slot,
     /// Settings to start with.
@@ -48,6 +48,16 @@ pub struct PublishHello {
     pub keep_neutral: bool,
     /// What is known of the performer.
     pub profile: Option<ProfileChoice>,
+}
+
+/// A session that a publisher wants to have back, as the server's `ready` told it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Resume {
+    /// Its number in the room. A server that is started anew may give it to somebody else.
+    pub session: u32,
+    /// What nobody else was told; at most [`MAX_RESUME_KEY`](crate::limits::MAX_RESUME_KEY) bytes. `None` from a client that does not
+    /// know of it.
+    pub key: Option<String>,
 }
 
 impl PublishHello {

@@ -46,18 +46,36 @@ globalThis.WebSocket = class {
 const link = new PublishLink("demo", () => ({ source: "test" }), { state() {} });
 link.start();
 sockets[0].onopen();
-sockets[0].onmessage({ data: JSON.stringify({ type: "ready", session: 7 }) });
+sockets[0].onmessage({ data: JSON.stringify({ type: "ready", session: 7, resume_key: "a1" }) });
 await sockets[0].onclose();
 link.connect(false);
 sockets[1].onopen();
 const [firstHello, again] = [sockets[0].sent[0], sockets[1].sent[0]];
 check("a first hello is nobody's who comes back", !("resume" in firstHello) && !("keep_neutral" in firstHello), JSON.stringify(firstHello));
-check("who comes back names its own session", again.resume === 7 && again.keep_neutral === true && !again.takeover, JSON.stringify(again));
+check("who comes back names its own session", again.resume === 7 && again.resume_key === "a1" && again.keep_neutral === true && !again.takeover, JSON.stringify(again));
 link.stop();
 link.start();
 sockets[2].onopen();
 check("who starts anew takes nothing back", !("resume" in sockets[2].sent[0]));
 link.stop();
+
+// Errors that end a session: which of them the page comes back after.
+const ends = async (messages, isBack) => {
+  const states = [];
+  const publishing = new PublishLink("demo", () => ({ source: "test" }), { state: (state) => states.push(state) });
+  publishing.start();
+  const mine = sockets.at(-1);
+  mine.onopen();
+  for (const message of [...(isBack ? [{ type: "ready", session: 7 }] : []), ...messages]) mine.onmessage({ data: JSON.stringify(message) });
+  await mine.onclose();
+  publishing.stop();
+  return states.at(-2);
+};
+const error = (code) => [{ type: "error", code, message: "words" }];
+check("a node that ends, or asks a cluster in vain, is come back to", (await ends([])) === "lost" && (await ends(error("shutting_down"))) === "lost" && (await ends(error("cluster"))) === "lost");
+check("a slot that is taken is somebody's, unless it was one's own", (await ends(error("room_taken"))) === "taken" && (await ends(error("room_taken"), true)) === "lost");
+check("so is a room at another node", (await ends(error("room_elsewhere"))) === "taken" && (await ends(error("room_elsewhere"), true)) === "lost");
+check("who was sent away, or is wrong, stays away", (await ends(error("taken_over"), true)) === "taken" && (await ends(error("bad_hello"))) === "refused");
 
 // The play bar.
 check("times are minutes and seconds", clockText(0) === "0:00.0" && clockText(75.26) === "1:15.3" && clockText(59.96) === "1:00.0");

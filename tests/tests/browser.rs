@@ -41,6 +41,9 @@ const MOST_FIRST_PICTURE: f64 = 20.0;
 const PACKETS: std::ops::RangeInclusive<u64> = 0..=60;
 const DRAWS: [u64; 3] = [0, 1600, 2400];
 
+/// Where Debian puts it, which only root's path leads to.
+const NATS: &str = "/usr/sbin/nats-server";
+
 /// Browsers take turns: each takes all there is of a small machine.
 static TURN: Mutex<()> = Mutex::new(());
 
@@ -72,6 +75,7 @@ fn main() -> ExitCode {
         trial("the_page_lets_in_who_has_a_token", lack.is_none(), the_page_lets_in_who_has_a_token),
         trial("the_page_records_and_replays", lack.is_none(), the_page_records_and_replays),
         trial("the_page_survives_the_server", lack.is_none(), the_page_survives_the_server),
+        trial("the_page_goes_on_at_another_node", lack.is_none() && has(NATS), the_page_goes_on_at_another_node),
         trial("a_lost_graphics_device_is_replaced", lack.is_none(), || on_a_server("lost.mjs")),
         trial("publish_to_shown_picture_takes_so_long_with_webgl2", lack.is_none(), || latency("webgl")),
         trial("publish_to_shown_picture_takes_so_long_with_webgpu", lack.is_none(), || latency("webgpu")),
@@ -335,6 +339,11 @@ fn a_newcomers_way() -> Result<()> {
         Some(&server),
         &[("RHYTID_CLIP", &film()), ("RHYTID_SERVER", &program), ("RHYTID_UDP", Path::new(&port)), ("RHYTID_FEED", &feed)],
     )
+}
+
+fn the_page_goes_on_at_another_node() -> Result<()> {
+    let server = rhytid_tests::program("rhytid-server")?;
+    script("nodes.mjs", None, &[("RHYTID_SERVER", &server), ("RHYTID_NATS", Path::new(NATS))])
 }
 
 fn the_page_survives_the_server() -> Result<()> {

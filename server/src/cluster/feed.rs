@@ -113,7 +113,7 @@ mod tests {
     use crate::room::{Others, Publishing, RoomError, SlotClaim};
     use rhytid_shared::packet::{Decoder, PacketLayout};
     use rhytid_shared::view::ViewHello;
-    use rhytid_shared::{Character, FaceFrame};
+    use rhytid_shared::{Character, FaceFrame, Resume};
     use tokio::sync::{mpsc, watch};
 
     /// A node's rooms, and what leaves them for other nodes.
@@ -285,8 +285,18 @@ mod tests {
         assert_eq!(claim(None).err(), Some(RoomError::Elsewhere), "the room's home is not here");
         rooms.lead(&name(), 7, true, 0).unwrap();
         let first = publish(&rooms, &layout, 1);
-        assert_eq!(claim(Some(first.session + 1)).err(), Some(RoomError::Taken));
-        let (second, _evicted) = claim(Some(first.session)).unwrap();
+        let named = |session, key: Option<&str>| Some(Resume { session, key: key.map(str::to_owned) });
+        let own = first.key.clone();
+        for (session, key) in [(first.session + 1, None), (first.session + 1, Some(&*own)), (first.session, Some("a stranger's"))] {
+            assert_eq!(claim(named(session, key)).err(), Some(RoomError::Taken), "{session} {key:?}");
+            assert!(!rooms.is_free_for(&name(), named(session, key).as_ref()));
+        }
+        assert!(!rooms.is_free_for(&name(), None) && rooms.is_free_for(&name(), named(first.session, Some(&own)).as_ref()));
+        let (second, _evicted) = claim(named(first.session, Some(&own))).unwrap();
+        assert_ne!(second.key, own);
+        // An older client does not know its key; in a cluster no other session has had its number.
+        let before = second.session;
+        let (second, _evicted) = claim(named(before, None)).unwrap();
         assert!(second.session > first.session);
         // One that is not the home any more has no publishers.
         rooms.evict(&name(), Some(8));

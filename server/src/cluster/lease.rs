@@ -46,9 +46,6 @@ pub(crate) enum LeaseError {
         /// Where.
         address: String,
     },
-    /// NATS does not answer as it should.
-    #[error("the cluster does not answer: {0}")]
-    Cluster(String),
     /// It has no place here.
     #[error(transparent)]
     Room(#[from] RoomError),
@@ -63,7 +60,6 @@ impl LeaseError {
         match self {
             Self::Taken => "room_taken",
             Self::Elsewhere { .. } => "room_elsewhere",
-            Self::Cluster(_) => "cluster",
             Self::Room(error) => error.code(),
             Self::Leaving => "shutting_down",
         }
@@ -235,16 +231,25 @@ impl Cluster {
     }
 
     async fn claim(&self, rooms: &Rooms, room: &RoomName, hello: &PublishHello) -> Result<(), LeaseError> {
+        let question = EnterQuestion {
+            room: room.to_string(),
+            takeover: hello.takeover,
+            resume: hello.resume.as_ref().map(|resume| resume.session),
+            resume_key: hello.resume.as_ref().and_then(|resume| resume.key.clone()),
+        };
         let Some(buckets) = self.buckets.get().filter(|_| self.problem().is_none()) else {
+            self.ask_known_home(&question, room, &hello.slot.name).await?;
             return self.hold_alone(rooms, room);
         };
-        let question = EnterQuestion { room: room.to_string(), takeover: hello.takeover, resume: hello.resume };
         for _ in 0..MOST_TRIES {
             let entry = match within(buckets.leases.entry(room.as_str())).await {
                 Some(Ok(entry)) => entry,
-                Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                // NATS has gone in this moment.
-                None => return self.hold_alone(rooms, room),
+                // NATS has gone in this moment, or its servers are choosing one that leads them.
+                told => {
+                    note_unrecorded(room, told);
+                    self.ask_known_home(&question, room, &hello.slot.name).await?;
+                    return self.hold_alone(rooms, room);
+                }
             };
             let found = entry.filter(|entry| entry.operation == Operation::Put);
             let found = found.and_then(|entry| Some((entry.revision, serde_json::from_slice::<Lease>(&entry.value).ok()?)));
@@ -258,14 +263,18 @@ impl Cluster {
                 Some((revision, _)) => match within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => continue,
-                    Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                    None => return self.hold_alone(rooms, room),
+                    told => {
+                        note_unrecorded(room, told);
+                        return self.hold_alone(rooms, room);
+                    }
                 },
                 None => match within(buckets.leases.create(room.as_str(), text_of(&lease))).await {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == CreateErrorKind::AlreadyExists => continue,
-                    Some(Err(error)) => return Err(LeaseError::Cluster(error.to_string())),
-                    None => return self.hold_alone(rooms, room),
+                    told => {
+                        note_unrecorded(room, told);
+                        return self.hold_alone(rooms, room);
+                    }
                 },
             };
             rooms.forget_kept(room);
@@ -282,6 +291,15 @@ impl Cluster {
 
     fn own_lease(&self, epoch: u64, sessions: u32) -> Lease {
         Lease { node: self.node.clone(), address: self.address.clone(), epoch, sessions }
+    }
+
+    /// As [`Self::ask_to_leave`], where NATS keeps no records but lets nodes talk: what it has told before says whom to ask.
+    async fn ask_known_home(&self, question: &EnterQuestion, room: &RoomName, slot: &str) -> Result<(), LeaseError> {
+        let known = lock(&self.leases).get(room).cloned();
+        match known.filter(|lease| !lease.node.is_empty() && lease.node != self.node && self.can_talk()) {
+            Some(lease) => self.ask_to_leave(&lease, question, slot).await,
+            None => Ok(()),
+        }
     }
 
     /// Has a room's home let go of it, or says why it does not. One that is dead does not answer, nor one that is stopped: its
@@ -527,6 +545,12 @@ impl Cluster {
         // Whoever comes for the rest finds that nobody answers.
         let _ = tokio::time::timeout(Duration::from_secs(1), all).await;
     }
+}
+
+/// Notes why a room opens before NATS has a record of it.
+fn note_unrecorded<T, E: std::fmt::Display>(room: &RoomName, told: Option<Result<T, E>>) {
+    let why = told.and_then(Result::err).map_or_else(|| "no answer".to_owned(), |error| error.to_string());
+    tracing::warn!(%room, why, "no lease to be had of NATS: the room opens here, and is claimed when it can be");
 }
 
 fn text_of(lease: &Lease) -> Bytes {

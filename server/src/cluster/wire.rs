@@ -1,7 +1,7 @@
 //! What travels between nodes: a room's state packets, and small JSON questions and answers.
 
 use crate::room::RoomListing;
-use rhytid_shared::{Calibration, Profile};
+use rhytid_shared::{Calibration, Profile, Resume};
 use serde::{Deserialize, Serialize};
 use tokio_tungstenite::tungstenite::Bytes;
 
@@ -85,6 +85,15 @@ pub(crate) struct EnterQuestion {
     pub takeover: bool,
     /// A publisher wants to have back what it had in this session.
     pub resume: Option<u32>,
+    /// With this key, which that session was told.
+    pub resume_key: Option<String>,
+}
+
+impl EnterQuestion {
+    /// What a publisher wants to have back.
+    pub fn resume(&self) -> Option<Resume> {
+        Some(Resume { session: self.resume?, key: self.resume_key.clone() })
+    }
 }
 
 /// What a home says to that.

@@ -9,7 +9,7 @@ use super::recorder::Item;
 use crate::config::seconds;
 use crate::room::{Evicted, Publishing, RoomError, SlotClaim};
 use crate::service::Hub;
-use rhytid_shared::{PublishHello, RoomName};
+use rhytid_shared::{PublishHello, Resume, RoomName};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -353,12 +353,12 @@ struct Seat {
 }
 
 /// Whose place a player takes.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Default)]
 struct Hold {
     /// Anybody's.
     takeover: bool,
     /// That of this session, its own before.
-    resume: Option<u32>,
+    resume: Option<Resume>,
 }
 
 impl Seat {
@@ -529,7 +529,8 @@ impl<'a> Player<'a> {
         if self.is_evicted() {
             return;
         }
-        let resume = Some(self.seat.place.session);
+        let place = &self.seat.place;
+        let resume = Some(Resume { session: place.session, key: Some(place.key.to_string()) });
         match Seat::take(self.hub, &self.room, &self.source, Hold { resume, ..Hold::default() }) {
             Ok(seat) => {
                 self.seat = seat;

@@ -4,7 +4,7 @@ use super::{KeyPacket, Latest, MAX_SLOTS, Neutral, Room, RoomError, RoomState, R
 use crate::cluster::{Kept, Outlet, StateHead};
 use crate::framed::Framed;
 use rhytid_shared::packet::{Decoder, PacketKind};
-use rhytid_shared::{FaceFrame, RoomName};
+use rhytid_shared::{FaceFrame, Resume, RoomName};
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
@@ -76,6 +76,11 @@ impl Rooms {
     pub fn slots(&self, name: &RoomName) -> Vec<(String, u32)> {
         let Some(room) = self.find(name) else { return Vec::new() };
         lock(&room.state).publishers.iter().map(|publisher| (publisher.claim.slot.name.clone(), publisher.session)).collect()
+    }
+
+    /// Nobody else publishes to a room than the one who wants to have it back.
+    pub fn is_free_for(&self, name: &RoomName, resume: Option<&Resume>) -> bool {
+        self.find(name).is_none_or(|room| lock(&room.state).publishers.iter().all(|publisher| publisher.is_of(resume, true)))
     }
 
     /// The greatest number that a session of a room has had, as far as is known here.

@@ -19,11 +19,13 @@ mod linux {
     mod http;
     mod namespace;
     mod nats;
+    mod nats_cluster;
     mod nodes;
     mod outages;
     #[path = "../process/mod.rs"]
     mod process;
     mod recordings;
+    mod replicas;
     mod rooms;
     mod senders;
     #[path = "../process/signal.rs"]
@@ -58,9 +60,13 @@ mod linux {
             trial("face_is_back_with_its_neutral_when_its_node_is_killed", outages::face_is_back_with_its_neutral_when_its_node_is_killed),
             trial("face_is_back_when_its_node_is_stopped_and_nothing_old_comes_when_it_goes_on", outages::stopped_node),
             trial("own_rooms_go_on_without_nats_and_all_joins_again_when_it_is_back", outages::nats_dies),
+            trial("neutral_face_found_without_nats_is_kept_when_it_is_back", outages::neutral_without_nats),
             trial("room_opened_at_two_nodes_without_nats_has_one_home_when_it_is_back", outages::two_homes),
             trial("node_that_starts_without_nats_takes_no_room_that_lives", outages::late_node),
             trial("node_that_ends_takes_no_room_that_it_was_asking_for", outages::leaves_while_it_asks),
+            trial("publisher_that_comes_while_its_node_ends_is_told_to_come_back", outages::comes_while_it_ends),
+            trial("rooms_go_on_whichever_of_three_nats_servers_dies", replicas::three_servers),
+            trial("more_replicas_than_nats_servers_are_said_to_be_too_many", replicas::too_few_servers),
             trial("lease_that_vanishes_is_claimed_anew_by_its_home", outages::lost_lease),
             trial("rolling_restart_under_load_is_hardly_seen", outages::rolling_restart),
             trial("tracker_over_udp_holds_its_room_before_all_nodes", rooms::tracker_over_udp),

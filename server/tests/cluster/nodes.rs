@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use std::net::TcpStream;
 use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::{Message, WebSocket};
 
 /// Of a publisher of weights.
@@ -56,9 +57,14 @@ impl Node {
     }
 
     pub fn publisher(&self, room: &str, hello: &str) -> Publisher {
-        let mut publisher = Publisher { socket: self.socket(&format!("{room}/publish")), t: 0.0 };
+        let mut publisher = self.silent_publisher(room);
         publisher.socket.send(Message::text(hello)).unwrap();
         publisher
+    }
+
+    /// One that has yet to say its hello.
+    pub fn silent_publisher(&self, room: &str) -> Publisher {
+        Publisher { socket: self.socket(&format!("{room}/publish")), t: 0.0 }
     }
 
     pub fn viewer(&self, room: &str) -> RawViewer {
@@ -122,11 +128,17 @@ impl Publisher {
 
     /// The last message of a server that ends the session.
     pub fn last_answer(&mut self) -> Value {
+        self.ending().0
+    }
+
+    /// The same with the code of its close.
+    pub fn ending(&mut self) -> (Value, Option<CloseCode>) {
         let mut last = Value::Null;
         loop {
             match self.socket.read() {
                 Ok(Message::Text(text)) => last = serde_json::from_str(&text).unwrap(),
-                Ok(Message::Close(_)) | Err(_) => return last,
+                Ok(Message::Close(frame)) => return (last, frame.map(|frame| frame.code)),
+                Err(_) => return (last, None),
                 Ok(_) => {}
             }
         }

@@ -12,6 +12,7 @@ use serde_json::Value;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
 /// A node is lost: so soon its viewers see the face again.
 const BACK_WITHIN: Duration = Duration::from_secs(2);
@@ -132,6 +133,33 @@ pub fn nats_dies() {
     assert_eq!((sessions.len(), num_twice(&near), num_twice(&far.finish())), (1, 0, 0));
 }
 
+/// A performer calibrates while NATS is away, and later loses the node.
+pub fn neutral_without_nats() {
+    let mut nats = Nats::start();
+    let url = nats.url();
+    let (mut a, b) = (Node::start(&url).ready(), Node::start(&url).ready());
+    nats.kill();
+    for node in [&a, &b] {
+        wait_for("the health to tell it", || node.get("/healthz").unwrap().starts_with("degraded").then_some(()));
+    }
+    let feed = write_feed(nats.folder.path(), 60);
+    let sender = send(&feed, &[&a.address], "demo", &nats.folder.path().join("send.log"));
+    let before = wait_for("a neutral", || neutral(&a, "demo"));
+    // Longer than NATS may take for any one answer.
+    std::thread::sleep(Duration::from_secs(1));
+    nats.restart();
+    for node in [&a, &b] {
+        wait_for("all to join again", || (node.get("/healthz").unwrap() == "ok\n").then_some(()));
+    }
+    // Two rounds, in which what waits is kept.
+    std::thread::sleep(Duration::from_millis(1500));
+    a.kill();
+    drop(sender);
+    let mut again = b.publisher("demo", &HELLO.replace("\"fps\"", "\"takeover\":true,\"keep_neutral\":true,\"fps\""));
+    let ready = again.answer();
+    assert_eq!(ready["kept_neutral"], true, "{ready}, after {before}");
+}
+
 /// Two nodes open one room while NATS is away; the viewer at a third one sees the one that keeps it, and never the other.
 pub fn two_homes() {
     let mut cluster = Cluster::start();
@@ -219,12 +247,29 @@ pub fn leaves_while_it_asks() {
     // It asks for two seconds.
     std::thread::sleep(Duration::from_millis(500));
     signal(&cluster.nodes[1].process, Signal::TERM);
-    // It is told as it waits, or by the one who asks for it.
-    let told = waiting.last_answer();
-    assert!(told.is_null() || told["code"] == "shutting_down", "it is not let in any more: {told}");
+    // Clients come back, or go on to the next node, after this code, and stay away after an error.
+    let (told, code) = waiting.ending();
+    assert_eq!((&told, code), (&Value::Null, Some(CloseCode::Away)), "it is not let in any more");
     assert!(cluster.nodes[1].process.wait().unwrap().success());
     assert!(!cluster.nodes[1].log().contains("home of a room"), "it takes no room that it cannot have");
     signal(&cluster.nodes[0].process, Signal::CONT);
+}
+
+/// A publisher says its hello to a node that is giving its rooms back.
+pub fn comes_while_it_ends() {
+    let nats = Nats::start();
+    let mut node = Node::start(&nats.url()).ready();
+    let _first = node.publisher("demo", HELLO).ready();
+    let mut second = node.silent_publisher("other");
+    // Giving the first one's room back takes as long as NATS may take.
+    signal(&nats.process, Signal::STOP);
+    signal(&node.process, Signal::TERM);
+    wait_for("its ending", || node.log().contains("shutting down").then_some(()));
+    second.socket.send(Message::text(HELLO)).unwrap();
+    let (told, code) = second.ending();
+    assert_eq!((&told, code), (&Value::Null, Some(CloseCode::Away)), "it is told to come back");
+    assert!(node.process.wait().unwrap().success());
+    signal(&nats.process, Signal::CONT);
 }
 
 /// A lease vanishes from NATS while its home lives.

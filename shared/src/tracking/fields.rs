@@ -49,6 +49,7 @@ pub(super) struct Fields {
     pub focal: Option<f64>,
     pub takeover: bool,
     pub resume: Option<f64>,
+    pub resume_key: Option<String>,
     pub slot: Option<String>,
     pub priority: Option<f64>,
     pub groups: Option<ChannelGroups>,
@@ -96,6 +97,7 @@ impl Fields {
             focal: None,
             takeover: false,
             resume: None,
+            resume_key: None,
             slot: None,
             priority: None,
             groups: None,
@@ -131,7 +133,7 @@ impl Fields {
         self.kind = None;
         (self.version, self.fps, self.focal, self.t) = (None, None, None, None);
         (self.source, self.layout, self.image) = (None, None, None);
-        (self.takeover, self.resume, self.keep_neutral) = (false, None, false);
+        (self.takeover, self.resume, self.resume_key, self.keep_neutral) = (false, None, None, false);
         (self.slot, self.priority, self.groups) = (None, None, None);
         (self.settings, self.change) = (None, Settings::default());
         (self.profile, self.step, self.seconds, self.name) = (None, None, None, None);
@@ -182,7 +184,7 @@ enum Key {
 }
 
 /// Every field of every message.
-const KEYS: [&str; 31] = [
+const KEYS: [&str; 32] = [
     "type",
     "t",
     "landmarks",
@@ -200,6 +202,7 @@ const KEYS: [&str; 31] = [
     "focal",
     "takeover",
     "resume",
+    "resume_key",
     "keep_neutral",
     "slot",
     "priority",
@@ -283,6 +286,7 @@ impl<'de> Visitor<'de> for MessageVisitor<'_> {
                 "focal" => fields.focal = Some(map.next_value_seed(Number("pixels"))?),
                 "takeover" => fields.takeover = map.next_value_seed(Flag)?,
                 "resume" => fields.resume = Some(map.next_value_seed(Number("a session's number"))?),
+                "resume_key" => fields.resume_key = Some(map.next_value_seed(Text("the key that ready told"))?),
                 "slot" => fields.slot = Some(map.next_value_seed(Text("the name of a source slot"))?),
                 "priority" => fields.priority = Some(map.next_value_seed(Number("a priority, 0 to 100"))?),
                 "groups" => map.next_value_seed(Groups(fields))?,

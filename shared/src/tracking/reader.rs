@@ -4,12 +4,13 @@ use super::binary;
 use super::fields::{Fields, Kind, LayoutField};
 use super::values::cut;
 use super::{
-    Command, FIT_SECONDS, FitRequest, FitStep, MessageError, PublishHello, PublishMessage, Settings, Slot, TrackingData, TrackingFrame,
+    Command, FIT_SECONDS, FitRequest, FitStep, MessageError, PublishHello, PublishMessage, Resume, Settings, Slot, TrackingData,
+    TrackingFrame,
 };
 use crate::character::Character;
 use crate::face::HeadPose;
 use crate::layout::Layout;
-use crate::limits::{FOCAL_RANGE, MAX_FEATURE_POINTS, MAX_SECONDS};
+use crate::limits::{FOCAL_RANGE, MAX_FEATURE_POINTS, MAX_RESUME_KEY, MAX_SECONDS};
 use crate::names::{NUM_ARKIT_SHAPES, RoomName};
 use crate::view::PROTOCOL_VERSION;
 use std::collections::{BTreeMap, BTreeSet};
@@ -154,7 +155,7 @@ impl PublishReader {
             image,
             focal: fields.focal.map(|focal| check_focal(focal, image)).transpose()?,
             takeover: fields.takeover,
-            resume: fields.resume.map(check_session).transpose()?,
+            resume: fields.resume.map(|session| check_resume(session, fields.resume_key.take())).transpose()?,
             settings: check_settings(fields.settings)?,
             slot: Slot::check(fields.slot.take(), fields.priority, fields.groups)?,
             keep_neutral: fields.keep_neutral,
@@ -285,10 +286,14 @@ fn missing(field: &str, expected: &str) -> MessageError {
     MessageError::new("missing_field", format!("field {field} is missing, expected {expected}"))
 }
 
-/// The number of a session that there may have been.
-fn check_session(session: f64) -> Result<u32, MessageError> {
+/// The number of a session that there may have been, and its key.
+fn check_resume(session: f64, key: Option<String>) -> Result<Resume, MessageError> {
+    if let Some(key) = key.as_ref().filter(|key| key.len() > MAX_RESUME_KEY) {
+        let message = format!("field resume_key has {} bytes, expected at most {MAX_RESUME_KEY}: the one that ready told", key.len());
+        return Err(MessageError::new("out_of_range", message));
+    }
     if session.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&session) {
-        return Ok(session as u32);
+        return Ok(Resume { session: session as u32, key });
     }
     Err(MessageError::new("out_of_range", format!("field resume is {session}, expected a whole number from 1 to {}", u32::MAX)))
 }
@@ -644,6 +649,7 @@ mod tests {
             ),
             (r#"{"type":"hello","version":1,"keep_neutral":1}"#, "wrong_type", "field keep_neutral"),
             (r#"{"type":"hello","version":1,"resume":0}"#, "out_of_range", "field resume is 0, expected a whole number from 1"),
+            (r#"{"type":"hello","version":1,"resume":1,"resume_key":7}"#, "wrong_type", "field resume_key"),
             (r#"{"type":"hello","version":1,"resume":1.5}"#, "out_of_range", "field resume is 1.5"),
             (r#"{"type":"hello","version":1,"resume":"last"}"#, "wrong_type", "field resume"),
             (r#"{"type":"hello","version":1,"slot":"a b"}"#, "out_of_range", "field slot is \"a b\", expected 1 to 64"),
@@ -673,12 +679,34 @@ mod tests {
     }
 
     #[test]
+    fn key_of_a_session_is_short_and_may_be_missing() {
+        let read = |key: &str| {
+            let (mut reader, mut frame) = reader();
+            let text = format!(r#"{{"type":"hello","version":1,"resume":7{key}}}"#);
+            reader.read(&text, &mut frame).map(|message| {
+                let PublishMessage::Hello(hello) = message else { panic!("{text}") };
+                hello.resume.unwrap().key
+            })
+        };
+        assert_eq!(read("").unwrap(), None);
+        let longest = "k".repeat(MAX_RESUME_KEY);
+        assert_eq!(read(&format!(r#","resume_key":"{longest}""#)).unwrap(), Some(longest.clone()));
+        let error = read(&format!(r#","resume_key":"{longest}k""#)).unwrap_err();
+        assert!(error.code == "out_of_range" && error.message.contains("resume_key has 65 bytes"), "{error}");
+    }
+
+    #[test]
     fn focal_lengths_that_lenses_have_are_taken() {
         for (focal, image) in [(40.0, "400,300"), (20_000.0, "400,300"), (0.1, "1,1"), (4e6, "1e5,1")] {
             let (mut reader, mut frame) = reader();
-            let text = format!(r#"{{"type":"hello","version":1,"focal":{focal},"image":[{image}],"keep_neutral":true,"resume":7}}"#);
+            let text = format!(
+                r#"{{"type":"hello","version":1,"focal":{focal},"image":[{image}],"keep_neutral":true,"resume":7,"resume_key":"a1"}}"#
+            );
             let Ok(PublishMessage::Hello(hello)) = reader.read(&text, &mut frame) else { panic!("{text} is refused") };
-            assert_eq!((hello.focal, hello.keep_neutral, hello.resume), (Some(focal as f32), true, Some(7)));
+            assert_eq!(
+                (hello.focal, hello.keep_neutral, hello.resume),
+                (Some(focal as f32), true, Some(Resume { session: 7, key: Some("a1".into()) }))
+            );
         }
     }
 

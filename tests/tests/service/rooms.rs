@@ -5,6 +5,7 @@ use rhytid_server::pipeline::Pipeline;
 use rhytid_server::{load_character, solve::SolveConfig};
 use rhytid_shared::view::JsonFrame;
 use rhytid_shared::{PublishMessage, PublishReader, TrackingFrame};
+use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -250,7 +251,7 @@ fn a_tracker_that_loses_the_face_holds_eases_and_returns_without_a_jump() {
         .enumerate()
         .map(|(i, line)| match i.checked_sub(1).filter(|i| lost.contains(i)) {
             Some(_) => {
-                let frame: serde_json::Value = serde_json::from_str(line).unwrap();
+                let frame: Value = serde_json::from_str(line).unwrap();
                 format!(r#"{{"type":"frame","t":{},"face":false}}"#, frame["t"])
             }
             None => line.to_owned(),
@@ -446,7 +447,40 @@ fn a_calibration_is_answered() {
         publisher.frame(f64::from(i) * 0.04, 0.1);
     }
     publisher.send(r#"{"type":"calibrate"}"#);
-    let answer: serde_json::Value = serde_json::from_str(&publisher.text()).unwrap();
+    let answer: Value = serde_json::from_str(&publisher.text()).unwrap();
     assert_eq!((answer["type"].as_str(), answer["requested"].as_bool()), (Some("calibrated"), Some(true)), "{answer}");
     assert!(answer["t"].as_f64().is_some() && answer["frames"].as_u64().is_some(), "{answer}");
+}
+
+#[test]
+fn session_of_a_server_that_was_started_anew_takes_no_strangers_slot() {
+    let ready = |server: &Server, more: &Value| {
+        let mut hello = json!({"type": "hello", "version": 1});
+        hello.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+        let mut publisher = server.publisher("demo");
+        publisher.send(&hello.to_string());
+        let answer: Value = serde_json::from_str(&publisher.text()).unwrap();
+        (publisher, answer)
+    };
+    let before = Server::start();
+    let (_own, told) = ready(&before, &json!({}));
+    let (session, key) = (told["session"].clone(), told["resume_key"].clone());
+    assert!(key.as_str().is_some_and(|key| key.len() == 32), "{told}");
+    // Its connection breaks off, and its ghost gives way to it alone.
+    let (_stranger, refused) = ready(&before, &json!({"resume": session, "resume_key": "0".repeat(32)}));
+    assert_eq!(refused["code"], "room_taken", "{refused}");
+    let (_back, told) = ready(&before, &json!({"resume": session, "resume_key": key}));
+    assert_eq!(told["type"], "ready", "{told}");
+
+    // Another start, where a stranger has come first: with the same number.
+    let anew = Server::start();
+    let (mut stranger, told) = ready(&anew, &json!({}));
+    assert_eq!(told["session"], session);
+    for resume in [json!({"resume": session, "resume_key": key}), json!({"resume": session})] {
+        let (_own, refused) = ready(&anew, &resume);
+        assert_eq!(refused["code"], "room_taken", "{resume}: {refused}");
+    }
+    let mut viewer = anew.json_viewer("demo");
+    stranger.frame(1.0, 0.3);
+    assert_eq!(viewer.next_json().session, 1);
 }
