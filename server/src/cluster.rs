@@ -7,6 +7,7 @@
 //! back.
 
 mod feed;
+mod keeping;
 mod lease;
 mod wire;
 
@@ -24,8 +25,10 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, RwLock, mpsc, watch};
+use tokio::task::JoinHandle;
 use tokio_tungstenite::tungstenite::Bytes;
 
+use keeping::Keeping;
 use lease::Entering;
 pub(crate) use lease::LeaseError;
 use lease::Leases;
@@ -48,13 +51,6 @@ const FIRST_JOIN: Duration = Duration::from_secs(2);
 const RECORDS_ROUND: Duration = Duration::from_secs(2);
 /// How long the others may take to find NATS again when it is back: until then who does not answer may live.
 const GATHERING: Duration = Duration::from_secs(3);
-/// Records that wait to be kept: one for each slot of a thousand rooms.
-const MOST_KEEPING: usize = 8192;
-/// How often a record is offered to a NATS that is there and does not take it: for ten seconds, in which its servers may choose who
-/// leads them.
-const MOST_KEEPING_TRIES: u32 = 20;
-/// Records that are sent to be kept at a time.
-const KEEPING_AT_ONCE: usize = 16;
 /// How often a node tells of itself and looks after its leases.
 const ROUND: Duration = Duration::from_millis(500);
 /// A node that has told something so often and has not heard itself is cut off, whatever TCP thinks: NATS's own pings wait for as
@@ -184,50 +180,6 @@ struct Held {
     empty_since: Option<Instant>,
 }
 
-/// What is to be kept in NATS: of each key the newest value only, so that none overtakes another.
-#[derive(Default)]
-struct Keeping {
-    waiting: Mutex<HashMap<String, Bytes>>,
-    is_there: Notify,
-}
-
-impl Keeping {
-    /// False where there is no place for one more key.
-    fn put(&self, key: String, value: Bytes) -> bool {
-        let mut waiting = lock(&self.waiting);
-        if waiting.len() >= MOST_KEEPING && !waiting.contains_key(&key) {
-            return false;
-        }
-        waiting.insert(key, value);
-        self.is_there.notify_one();
-        true
-    }
-
-    /// Puts back what could not be kept, unless there is something newer.
-    fn put_back(&self, key: String, value: Bytes) {
-        let mut waiting = lock(&self.waiting);
-        if waiting.len() < MOST_KEEPING {
-            waiting.entry(key).or_insert(value);
-            self.is_there.notify_one();
-        }
-    }
-
-    fn take_now(&self) -> HashMap<String, Bytes> {
-        std::mem::take(&mut *lock(&self.waiting))
-    }
-
-    /// Waits for values to keep.
-    async fn take(&self) -> HashMap<String, Bytes> {
-        loop {
-            let taken = self.take_now();
-            if !taken.is_empty() {
-                return taken;
-            }
-            self.is_there.notified().await;
-        }
-    }
-}
-
 /// Connections to NATS.
 struct Connections {
     /// Made so far.
@@ -278,6 +230,8 @@ pub(crate) struct Cluster {
     nodes: Mutex<HashMap<String, Told>>,
     leases: Mutex<Leases>,
     keeping: Keeping,
+    /// What empties it, until the service ends.
+    keeper: Mutex<Option<JoinHandle<()>>>,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -363,6 +317,7 @@ impl Cluster {
             nodes: Mutex::default(),
             leases: Mutex::default(),
             keeping: Keeping::default(),
+            keeper: Mutex::default(),
         }))
     }
 
@@ -463,7 +418,7 @@ impl Cluster {
         tasks.spawn(self.clone().look_at_records());
         tasks.spawn(feed::run(self.clone(), rooms));
         // Not cut off in the middle of what it has taken.
-        tokio::spawn(self.clone().keep_all(shutdown.clone()));
+        *lock(&self.keeper) = Some(tokio::spawn(self.clone().keep_all(shutdown.clone())));
         let mut shutdown = shutdown.clone();
         tokio::spawn(async move {
             stopped(&mut shutdown).await;
@@ -555,7 +510,7 @@ impl Cluster {
     async fn look_after(self: Arc<Self>, rooms: Weak<Rooms>) {
         let mut round = tokio::time::interval(ROUND);
         round.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        let mut watching: Option<tokio::task::JoinHandle<()>> = None;
+        let mut watching: Option<JoinHandle<()>> = None;
         loop {
             tokio::select! {
                 _ = round.tick() => {}
@@ -705,78 +660,6 @@ impl Cluster {
             kept: make("kept", MOST_KEPT_BYTES, ALL_KEPT_BYTES).await?,
         })
     }
-
-    /// What the cluster keeps of a room's slot.
-    async fn kept(&self, room: &RoomName, slot: &str) -> Option<Kept> {
-        let buckets = self.buckets.get()?;
-        let bytes = tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.get(format!("{room}.{slot}"))).await.ok()?.ok()??;
-        serde_json::from_slice(&bytes).ok()
-    }
-
-    /// Keeps what a room keeps of a slot, for whichever node its publisher comes to next.
-    pub fn keep(&self, room: &RoomName, slot: &str, kept: &Kept) {
-        let text = serde_json::to_vec(kept).expect("plain data can be written");
-        if !self.keeping.put(format!("{room}.{slot}"), text.into()) {
-            tracing::warn!(%room, slot, "neutral face not kept in the cluster: too many wait");
-        }
-    }
-
-    /// Keeps what there is to keep until the service ends. What NATS does not take is tried again, unless something newer has come.
-    async fn keep_all(self: Arc<Self>, mut shutdown: watch::Receiver<bool>) {
-        let mut tries: HashMap<String, u32> = HashMap::new();
-        loop {
-            let taken = tokio::select! {
-                taken = self.keeping.take() => taken,
-                () = stopped(&mut shutdown) => return,
-            };
-            let refused = self.keep_these(taken).await;
-            tries.retain(|key, _| refused.iter().any(|(refused, ..)| refused == key));
-            for (key, text, problem) in refused {
-                let num_tries = tries.entry(key.clone()).or_default();
-                // Without NATS it waits for as long as that takes.
-                *num_tries += u32::from(self.problem().is_none());
-                if *num_tries >= MOST_KEEPING_TRIES {
-                    tracing::warn!(key, problem, "neutral face not kept in the cluster");
-                    tries.remove(&key);
-                } else {
-                    tracing::debug!(key, problem, "neutral face not kept in the cluster yet");
-                    self.keeping.put_back(key, text);
-                }
-            }
-            if !tries.is_empty() {
-                tokio::select! {
-                    () = tokio::time::sleep(ROUND) => {}
-                    () = stopped(&mut shutdown) => return,
-                }
-            }
-        }
-    }
-
-    /// Keeps what publishers have left in the last moment.
-    pub async fn keep_rest(&self) {
-        // Without NATS each would wait for its own time.
-        let keeping = tokio::time::timeout(Duration::from_secs(1), self.keep_these(self.keeping.take_now())).await;
-        for (key, _, problem) in keeping.unwrap_or_default() {
-            tracing::warn!(key, problem, "neutral face not kept in the cluster");
-        }
-    }
-
-    /// Done with all of them, so that the next value of any key comes behind them. Gives those that were not taken, and why.
-    async fn keep_these(&self, taken: HashMap<String, Bytes>) -> Vec<(String, Bytes, String)> {
-        let Some(buckets) = self.buckets.get() else {
-            return taken.into_iter().map(|(key, text)| (key, text, "there is no bucket yet".to_owned())).collect();
-        };
-        let puts = taken.into_iter().map(async |(key, text)| {
-            let problem = match tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.put(&key, text.clone())).await {
-                Ok(Ok(_)) => return None,
-                Ok(Err(error)) => error.to_string(),
-                Err(_) => "no answer".to_owned(),
-            };
-            Some((key, text, problem))
-        });
-        let puts = futures_util::stream::iter(puts).buffer_unordered(KEEPING_AT_ONCE);
-        puts.filter_map(std::future::ready).collect().await
-    }
 }
 
 /// JetStream's servers are choosing who leads them, or have no majority for that.
@@ -837,21 +720,6 @@ fn without_password(url: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[tokio::test]
-    async fn newest_of_each_key_is_kept() {
-        let keeping = Keeping::default();
-        for (key, value) in [("a", "1"), ("b", "2"), ("a", "3")] {
-            assert!(keeping.put(key.into(), value.into()));
-        }
-        assert_eq!(keeping.take().await, HashMap::from([("a".into(), "3".into()), ("b".into(), "2".into())]));
-        assert!(keeping.put("a".into(), "4".into()));
-        keeping.put_back("a".into(), "3".into());
-        keeping.put_back("b".into(), "2".into());
-        assert_eq!(keeping.take().await, HashMap::from([("a".into(), "4".into()), ("b".into(), "2".into())]));
-        assert!((0..MOST_KEEPING).all(|k| keeping.put(k.to_string(), Bytes::new())));
-        assert!(!keeping.put("one more".into(), Bytes::new()) && keeping.put("7".into(), "new".into()));
-    }
 
     #[test]
     fn passwords_are_not_shown() {

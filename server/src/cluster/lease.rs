@@ -191,6 +191,8 @@ impl Cluster {
         }
         let slot = &hello.slot.name;
         if let Some(kept) = kept.filter(|_| is_new || !rooms.has_kept(room, slot)) {
+            // It may be this node's own, and lost to the cluster.
+            self.fill(room, slot, &kept);
             rooms.restore(room, slot, kept);
         }
         Ok(())
@@ -414,16 +416,19 @@ impl Cluster {
         if let Some(revision) = held.revision {
             let lease = Lease { sessions: rooms.num_sessions(room).wrapping_add(SESSIONS_AT_ONCE), ..held.lease };
             let renewed = within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await;
-            let mut held = lock(&self.held);
-            // Who has taken it meanwhile is heard of by the watch, too.
-            let Some(held) = held.get_mut(room).filter(|held| held.revision == Some(revision)) else { return };
-            match renewed {
-                Some(Ok(revision)) => (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now()),
-                // Its record is another, or is gone: it is claimed anew.
-                Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => held.revision = None,
-                Some(Err(error)) => tracing::debug!(%room, %error, "lease not renewed"),
-                None => tracing::debug!(%room, "lease not renewed: no answer"),
+            {
+                let mut held = lock(&self.held);
+                // Who has taken it meanwhile is heard of by the watch, too.
+                let Some(held) = held.get_mut(room).filter(|held| held.revision == Some(revision)) else { return };
+                match renewed {
+                    Some(Ok(revision)) => (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now()),
+                    // Its record is another, or is gone: it is claimed anew.
+                    Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => return held.revision = None,
+                    Some(Err(error)) => return tracing::debug!(%room, %error, "lease not renewed"),
+                    None => return tracing::debug!(%room, "lease not renewed: no answer"),
+                }
             }
+            self.keep_again(rooms, room, true);
             return;
         }
         // Opened while NATS was away, or held since before: whoever claims it first keeps it.
@@ -458,13 +463,16 @@ impl Cluster {
 
     /// What was held alone is held before all.
     fn confirm(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: u64) {
-        if let Some(held) = lock(&self.held).get_mut(room) {
+        {
+            let mut held = lock(&self.held);
+            let Some(held) = held.get_mut(room) else { return };
             if let Err(error) = rooms.lead(room, lease.epoch, true, 0) {
                 return tracing::warn!(%room, %error, "it is not there any more");
             }
             tracing::info!(%room, epoch = lease.epoch, "home of a room before all nodes");
             (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now());
         }
+        self.keep_again(rooms, room, false);
     }
 
     async fn give_back(&self, rooms: &Rooms, room: &RoomName, lease: &Lease, revision: Option<u64>) {

@@ -61,6 +61,7 @@ mod linux {
             trial("face_is_back_when_its_node_is_stopped_and_nothing_old_comes_when_it_goes_on", outages::stopped_node),
             trial("own_rooms_go_on_without_nats_and_all_joins_again_when_it_is_back", outages::nats_dies),
             trial("neutral_face_found_without_nats_is_kept_when_it_is_back", outages::neutral_without_nats),
+            trial("neutral_face_is_kept_again_when_nats_is_back_without_data", outages::neutral_without_data),
             trial("room_opened_at_two_nodes_without_nats_has_one_home_when_it_is_back", outages::two_homes),
             trial("node_that_starts_without_nats_takes_no_room_that_lives", outages::late_node),
             trial("node_that_ends_takes_no_room_that_it_was_asking_for", outages::leaves_while_it_asks),
