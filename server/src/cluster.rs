@@ -68,10 +68,12 @@ const KEPT_FOR: Duration = Duration::from_secs(24 * 3600);
 const MOST_LEASE_BYTES: i32 = 4096;
 /// Largest record kept of a performer.
 const MOST_KEPT_BYTES: i32 = 256 << 10;
-/// All leases: those of some 50,000 rooms. Beyond that the oldest goes, which is one that no home renews.
-const ALL_LEASE_BYTES: i64 = 16 << 20;
-/// All records of performers: of a thousand large ones, or tens of thousands as they are. Beyond that the oldest goes.
-const ALL_KEPT_BYTES: i64 = 256 << 20;
+/// All leases: those of some 25,000 rooms, of 215 bytes and up to 335 with long names. Beyond that the oldest goes, which is one that no home renews:
+/// where fewer rooms than that have a publisher or are opened within an hour.
+const ALL_LEASE_BYTES: i64 = 8 << 20;
+/// All records of performers: 5 KB with 68 landmarks, some 30 KB with 478. That is a thousand of the latter; beyond that the oldest
+/// goes. NATS sets both aside for each character, at each server that keeps them, whether they are used or not.
+const ALL_KEPT_BYTES: i64 = 32 << 20;
 
 /// Which cluster a node joins, and how it gets in.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Deserialize, clap::Args)]
@@ -649,6 +651,15 @@ impl Cluster {
                 ..stream::Config::default()
             };
             let stream = jetstream.get_or_create_stream(config).await.map_err(|error| told_by(&error))?;
+            let known = &stream.cached_info().config;
+            if (known.max_bytes, known.max_message_size, known.max_age) != (max_bytes, max_message_size, KEPT_FOR) {
+                // Another version has made it.
+                let config = stream::Config { max_bytes, max_message_size, max_age: KEPT_FOR, ..known.clone() };
+                match jetstream.update_stream(config).await {
+                    Ok(_) => tracing::info!(bucket, before = known.max_bytes, max_bytes, "the bucket has other bounds now"),
+                    Err(error) => tracing::warn!(bucket, error = told_by(&error), "the bucket's bounds stay as they were"),
+                }
+            }
             let num_replicas = stream.cached_info().config.num_replicas;
             if num_replicas != self.replicas {
                 tracing::warn!(bucket, num_replicas, wanted = self.replicas, "the bucket is there already: `nats stream edit` changes it");
