@@ -32,7 +32,7 @@ use keeping::Keeping;
 use lease::Entering;
 pub(crate) use lease::LeaseError;
 use lease::Leases;
-use wire::{EnterAnswer, EnterQuestion, LISTED_AT_ONCE, Lease, MOST_LISTED, NodeListing};
+use wire::{EnterAnswer, EnterQuestion, LISTED_AT_ONCE, Lease, ListingHead, MOST_LISTED, NodeListing};
 pub(crate) use wire::{Kept, StateHead};
 
 /// Packets that wait for the connection to NATS; what finds no place is lost to other nodes, whose viewers see the next one.
@@ -43,6 +43,8 @@ const OLD: Duration = Duration::from_millis(500);
 const MOST_SENDING: usize = 512;
 /// How long NATS, or another node through it, may take to answer.
 const REQUEST_TIMEOUT: Duration = Duration::from_millis(300);
+/// How long they may take where this node is not to go on without them: a slow NATS is no sign that nobody has a room.
+const PATIENT_TIMEOUT: Duration = Duration::from_secs(1);
 /// How long NATS may take to make a bucket.
 const BUCKET_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long a start waits for NATS: a publisher that comes in the first moment would else find a node that is on its own.
@@ -274,7 +276,7 @@ impl Cluster {
             .connection_timeout(Duration::from_secs(3))
             // Three of them without an answer end a connection.
             .ping_interval(Duration::from_secs(1))
-            .request_timeout(Some(REQUEST_TIMEOUT))
+            .request_timeout(Some(PATIENT_TIMEOUT))
             .subscription_capacity(MOST_UNREAD)
             .client_capacity(MOST_SENDING)
             .reconnect_delay_callback(|attempts| Duration::from_millis((50 * attempts as u64).min(1000)))
@@ -481,24 +483,31 @@ impl Cluster {
     async fn hear_of_nodes(self: Arc<Self>, rooms: Weak<Rooms>) {
         let Ok(mut listings) = self.client.subscribe(self.subject("listing")).await else { return };
         while let Some(message) = listings.next().await {
-            let told = match serde_json::from_slice::<NodeListing>(&message.payload) {
-                Ok(told) => told,
-                Err(error) => {
-                    tracing::debug!(%error, "listing of another node not read");
-                    continue;
-                }
+            let Ok(ListingHead { node }) = serde_json::from_slice(&message.payload) else {
+                tracing::debug!("listing of nobody not read");
+                continue;
             };
-            if told.node == self.node {
+            if node == self.node {
                 self.unheard.store(0, Ordering::SeqCst);
                 self.is_cut.store(false, Ordering::SeqCst);
                 continue;
             }
+            {
+                let mut nodes = lock(&self.nodes);
+                if nodes.len() >= MOST_NODES {
+                    nodes.retain(|_, told| told.heard.elapsed() < FORGOTTEN);
+                }
+                if nodes.len() >= MOST_NODES && !nodes.contains_key(&node) {
+                    continue;
+                }
+            }
+            let Some(told) = serde_json::from_slice::<NodeListing>(&message.payload).ok().filter(NodeListing::is_sound) else {
+                tracing::debug!("listing of another node not read");
+                continue;
+            };
             let Some(rooms) = rooms.upgrade() else { return };
             rooms.want(told.is_partial, told.rooms.iter().filter(|room| room.is_wanted()).map(|room| room.name.as_str()));
             let mut nodes = lock(&self.nodes);
-            if nodes.len() >= MOST_NODES && !nodes.contains_key(&told.node) {
-                continue;
-            }
             let known = nodes.entry(told.node).or_insert_with(|| Told { heard: Instant::now(), address: String::new(), parts: Vec::new() });
             (known.heard, known.address) = (Instant::now(), told.address);
             known.parts.resize_with(told.of.clamp(1, MOST_LISTED / LISTED_AT_ONCE), Vec::new);
