@@ -169,6 +169,13 @@ pub fn neutral_without_data() {
     let folder = nats.folder.clone();
     let sender = send(&feed, &[&a.address], "demo", &folder.path().join("send.log"));
     let before = wait_for("a neutral", || neutral(&a, "demo"));
+    // What comes later would be kept without this.
+    wait_for("the settings", || {
+        // So many may be asked for.
+        std::thread::sleep(Duration::from_millis(100));
+        (settings(&a, "demo")["gains"]["mouth"] == 0.75).then_some(())
+    });
+    std::thread::sleep(Duration::from_millis(300));
     nats.kill();
     for node in [&a, &b] {
         wait_for("the health to tell it", || node.get("/healthz").unwrap().starts_with("degraded").then_some(()));
