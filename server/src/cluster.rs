@@ -7,6 +7,7 @@
 //! back.
 
 mod feed;
+mod keeping;
 mod lease;
 mod wire;
 
@@ -25,13 +26,14 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, RwLock, mpsc, watch};
-use tokio::task::JoinSet;
+use tokio::task::{JoinHandle, JoinSet};
 use tokio_tungstenite::tungstenite::Bytes;
 
+use keeping::Keeping;
 use lease::Entering;
 pub(crate) use lease::LeaseError;
 use lease::Leases;
-use wire::{EnterAnswer, EnterQuestion, LISTED_AT_ONCE, Lease, MOST_LISTED, NodeListing};
+use wire::{EnterAnswer, EnterQuestion, LISTED_AT_ONCE, Lease, ListingHead, MOST_LISTED, NodeListing};
 pub(crate) use wire::{Kept, StateHead};
 
 /// Packets that wait for the connection to NATS; what finds no place is lost to other nodes, whose viewers see the next one.
@@ -42,6 +44,8 @@ const OLD: Duration = Duration::from_millis(500);
 const MOST_SENDING: usize = 512;
 /// How long NATS, or another node through it, may take to answer.
 const REQUEST_TIMEOUT: Duration = Duration::from_millis(300);
+/// How long they may take where this node is not to go on without them: a slow NATS is no sign that nobody has a room.
+const PATIENT_TIMEOUT: Duration = Duration::from_secs(1);
 /// How long NATS may take to make a bucket.
 const BUCKET_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long a start waits for NATS: a publisher that comes in the first moment would else find a node that is on its own.
@@ -50,13 +54,6 @@ const FIRST_JOIN: Duration = Duration::from_secs(2);
 const RECORDS_ROUND: Duration = Duration::from_secs(2);
 /// How long the others may take to find NATS again when it is back: until then who does not answer may live.
 const GATHERING: Duration = Duration::from_secs(3);
-/// Records that wait to be kept: one for each slot of a thousand rooms.
-const MOST_KEEPING: usize = 8192;
-/// How often a record is offered to a NATS that is there and does not take it: for ten seconds, in which its servers may choose who
-/// leads them.
-const MOST_KEEPING_TRIES: u32 = 20;
-/// Records that are sent to be kept at a time.
-const KEEPING_AT_ONCE: usize = 16;
 /// How often a node tells of itself and looks after its leases.
 const ROUND: Duration = Duration::from_millis(500);
 /// A node that has told something so often and has not heard itself is cut off, whatever TCP thinks: NATS's own pings wait for as
@@ -74,10 +71,12 @@ const KEPT_FOR: Duration = Duration::from_secs(24 * 3600);
 const MOST_LEASE_BYTES: i32 = 4096;
 /// Largest record kept of a performer.
 const MOST_KEPT_BYTES: i32 = 256 << 10;
-/// All leases: those of some 50,000 rooms. Beyond that the oldest goes, which is one that no home renews.
-const ALL_LEASE_BYTES: i64 = 16 << 20;
-/// All records of performers: of a thousand large ones, or tens of thousands as they are. Beyond that the oldest goes.
-const ALL_KEPT_BYTES: i64 = 256 << 20;
+/// All leases: those of some 25,000 rooms, of 215 bytes and up to 335 with long names. Beyond that the oldest goes, which is one that no home renews:
+/// where fewer rooms than that have a publisher or are opened within an hour.
+const ALL_LEASE_BYTES: i64 = 8 << 20;
+/// All records of performers: 5 KB with 68 landmarks, some 30 KB with 478. That is a thousand of the latter; beyond that the oldest
+/// goes. NATS sets both aside for each character, at each server that keeps them, whether they are used or not.
+const ALL_KEPT_BYTES: i64 = 32 << 20;
 
 /// Which cluster a node joins, and how it gets in.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Deserialize, clap::Args)]
@@ -186,50 +185,6 @@ struct Held {
     empty_since: Option<Instant>,
 }
 
-/// What is to be kept in NATS: of each key the newest value only, so that none overtakes another.
-#[derive(Default)]
-struct Keeping {
-    waiting: Mutex<HashMap<String, Bytes>>,
-    is_there: Notify,
-}
-
-impl Keeping {
-    /// False where there is no place for one more key.
-    fn put(&self, key: String, value: Bytes) -> bool {
-        let mut waiting = lock(&self.waiting);
-        if waiting.len() >= MOST_KEEPING && !waiting.contains_key(&key) {
-            return false;
-        }
-        waiting.insert(key, value);
-        self.is_there.notify_one();
-        true
-    }
-
-    /// Puts back what could not be kept, unless there is something newer.
-    fn put_back(&self, key: String, value: Bytes) {
-        let mut waiting = lock(&self.waiting);
-        if waiting.len() < MOST_KEEPING {
-            waiting.entry(key).or_insert(value);
-            self.is_there.notify_one();
-        }
-    }
-
-    fn take_now(&self) -> HashMap<String, Bytes> {
-        std::mem::take(&mut *lock(&self.waiting))
-    }
-
-    /// Waits for values to keep.
-    async fn take(&self) -> HashMap<String, Bytes> {
-        loop {
-            let taken = self.take_now();
-            if !taken.is_empty() {
-                return taken;
-            }
-            self.is_there.notified().await;
-        }
-    }
-}
-
 /// Connections to NATS.
 struct Connections {
     /// Made so far.
@@ -280,6 +235,8 @@ pub(crate) struct Cluster {
     nodes: Mutex<HashMap<String, Told>>,
     leases: Mutex<Leases>,
     keeping: Keeping,
+    /// What empties it, until the service ends.
+    keeper: Mutex<Option<JoinHandle<()>>>,
 }
 
 impl Cluster {
@@ -316,7 +273,7 @@ impl Cluster {
             .connection_timeout(Duration::from_secs(3))
             // Three of them without an answer end a connection.
             .ping_interval(Duration::from_secs(1))
-            .request_timeout(Some(REQUEST_TIMEOUT))
+            .request_timeout(Some(PATIENT_TIMEOUT))
             .subscription_capacity(MOST_UNREAD)
             .client_capacity(MOST_SENDING)
             .reconnect_delay_callback(|attempts| Duration::from_millis((50 * attempts as u64).min(1000)))
@@ -361,6 +318,7 @@ impl Cluster {
             nodes: Mutex::default(),
             leases: Mutex::default(),
             keeping: Keeping::default(),
+            keeper: Mutex::default(),
         }))
     }
 
@@ -461,7 +419,7 @@ impl Cluster {
         tasks.spawn(self.clone().look_at_records());
         tasks.spawn(feed::run(self.clone(), rooms));
         // Not cut off in the middle of what it has taken.
-        tokio::spawn(self.clone().keep_all(shutdown.clone()));
+        *lock(&self.keeper) = Some(tokio::spawn(self.clone().keep_all(shutdown.clone())));
         let mut shutdown = shutdown.clone();
         tokio::spawn(async move {
             stopped(&mut shutdown).await;
@@ -522,24 +480,31 @@ impl Cluster {
     async fn hear_of_nodes(self: Arc<Self>, rooms: Weak<Rooms>) {
         let Ok(mut listings) = self.client.subscribe(self.subject("listing")).await else { return };
         while let Some(message) = listings.next().await {
-            let told = match serde_json::from_slice::<NodeListing>(&message.payload) {
-                Ok(told) => told,
-                Err(error) => {
-                    tracing::debug!(%error, "listing of another node not read");
-                    continue;
-                }
+            let Ok(ListingHead { node }) = serde_json::from_slice(&message.payload) else {
+                tracing::debug!("listing of nobody not read");
+                continue;
             };
-            if told.node == self.node {
+            if node == self.node {
                 self.unheard.store(0, Ordering::SeqCst);
                 self.is_cut.store(false, Ordering::SeqCst);
                 continue;
             }
+            {
+                let mut nodes = lock(&self.nodes);
+                if nodes.len() >= MOST_NODES {
+                    nodes.retain(|_, told| told.heard.elapsed() < FORGOTTEN);
+                }
+                if nodes.len() >= MOST_NODES && !nodes.contains_key(&node) {
+                    continue;
+                }
+            }
+            let Some(told) = serde_json::from_slice::<NodeListing>(&message.payload).ok().filter(NodeListing::is_sound) else {
+                tracing::debug!("listing of another node not read");
+                continue;
+            };
             let Some(rooms) = rooms.upgrade() else { return };
             rooms.want(told.is_partial, told.rooms.iter().filter(|room| room.is_wanted()).map(|room| room.name.as_str()));
             let mut nodes = lock(&self.nodes);
-            if nodes.len() >= MOST_NODES && !nodes.contains_key(&told.node) {
-                continue;
-            }
             let known = nodes.entry(told.node).or_insert_with(|| Told { heard: Instant::now(), address: String::new(), parts: Vec::new() });
             (known.heard, known.address) = (Instant::now(), told.address);
             known.parts.resize_with(told.of.clamp(1, MOST_LISTED / LISTED_AT_ONCE), Vec::new);
@@ -693,6 +658,15 @@ impl Cluster {
                 ..stream::Config::default()
             };
             let stream = jetstream.get_or_create_stream(config).await.map_err(|error| told_by(&error))?;
+            let known = &stream.cached_info().config;
+            if (known.max_bytes, known.max_message_size, known.max_age) != (max_bytes, max_message_size, KEPT_FOR) {
+                // Another version has made it.
+                let config = stream::Config { max_bytes, max_message_size, max_age: KEPT_FOR, ..known.clone() };
+                match jetstream.update_stream(config).await {
+                    Ok(_) => tracing::info!(bucket, before = known.max_bytes, max_bytes, "the bucket has other bounds now"),
+                    Err(error) => tracing::warn!(bucket, error = told_by(&error), "the bucket's bounds stay as they were"),
+                }
+            }
             let num_replicas = stream.cached_info().config.num_replicas;
             if num_replicas != self.replicas {
                 tracing::warn!(bucket, num_replicas, wanted = self.replicas, "the bucket is there already: `nats stream edit` changes it");
@@ -703,78 +677,6 @@ impl Cluster {
             leases: make("leases", MOST_LEASE_BYTES, ALL_LEASE_BYTES).await?,
             kept: make("kept", MOST_KEPT_BYTES, ALL_KEPT_BYTES).await?,
         })
-    }
-
-    /// What the cluster keeps of a room's slot.
-    async fn kept(&self, room: &RoomName, slot: &str) -> Option<Kept> {
-        let buckets = self.buckets.get()?;
-        let bytes = tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.get(format!("{room}.{slot}"))).await.ok()?.ok()??;
-        serde_json::from_slice(&bytes).ok()
-    }
-
-    /// Keeps what a room keeps of a slot, for whichever node its publisher comes to next.
-    pub fn keep(&self, room: &RoomName, slot: &str, kept: &Kept) {
-        let text = serde_json::to_vec(kept).expect("plain data can be written");
-        if !self.keeping.put(format!("{room}.{slot}"), text.into()) {
-            tracing::warn!(%room, slot, "neutral face not kept in the cluster: too many wait");
-        }
-    }
-
-    /// Keeps what there is to keep until the service ends. What NATS does not take is tried again, unless something newer has come.
-    async fn keep_all(self: Arc<Self>, mut shutdown: watch::Receiver<bool>) {
-        let mut tries: HashMap<String, u32> = HashMap::new();
-        loop {
-            let taken = tokio::select! {
-                taken = self.keeping.take() => taken,
-                () = stopped(&mut shutdown) => return,
-            };
-            let refused = self.keep_these(taken).await;
-            tries.retain(|key, _| refused.iter().any(|(refused, ..)| refused == key));
-            for (key, text, problem) in refused {
-                let num_tries = tries.entry(key.clone()).or_default();
-                // Without NATS it waits for as long as that takes.
-                *num_tries += u32::from(self.problem().is_none());
-                if *num_tries >= MOST_KEEPING_TRIES {
-                    tracing::warn!(key, problem, "neutral face not kept in the cluster");
-                    tries.remove(&key);
-                } else {
-                    tracing::debug!(key, problem, "neutral face not kept in the cluster yet");
-                    self.keeping.put_back(key, text);
-                }
-            }
-            if !tries.is_empty() {
-                tokio::select! {
-                    () = tokio::time::sleep(ROUND) => {}
-                    () = stopped(&mut shutdown) => return,
-                }
-            }
-        }
-    }
-
-    /// Keeps what publishers have left in the last moment.
-    pub async fn keep_rest(&self) {
-        // Without NATS each would wait for its own time.
-        let keeping = tokio::time::timeout(Duration::from_secs(1), self.keep_these(self.keeping.take_now())).await;
-        for (key, _, problem) in keeping.unwrap_or_default() {
-            tracing::warn!(key, problem, "neutral face not kept in the cluster");
-        }
-    }
-
-    /// Done with all of them, so that the next value of any key comes behind them. Gives those that were not taken, and why.
-    async fn keep_these(&self, taken: HashMap<String, Bytes>) -> Vec<(String, Bytes, String)> {
-        let Some(buckets) = self.buckets.get() else {
-            return taken.into_iter().map(|(key, text)| (key, text, "there is no bucket yet".to_owned())).collect();
-        };
-        let puts = taken.into_iter().map(async |(key, text)| {
-            let problem = match tokio::time::timeout(REQUEST_TIMEOUT, buckets.kept.put(&key, text.clone())).await {
-                Ok(Ok(_)) => return None,
-                Ok(Err(error)) => error.to_string(),
-                Err(_) => "no answer".to_owned(),
-            };
-            Some((key, text, problem))
-        });
-        let puts = futures_util::stream::iter(puts).buffer_unordered(KEEPING_AT_ONCE);
-        puts.filter_map(std::future::ready).collect().await
     }
 }
 
@@ -836,21 +738,6 @@ fn without_password(url: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[tokio::test]
-    async fn newest_of_each_key_is_kept() {
-        let keeping = Keeping::default();
-        for (key, value) in [("a", "1"), ("b", "2"), ("a", "3")] {
-            assert!(keeping.put(key.into(), value.into()));
-        }
-        assert_eq!(keeping.take().await, HashMap::from([("a".into(), "3".into()), ("b".into(), "2".into())]));
-        assert!(keeping.put("a".into(), "4".into()));
-        keeping.put_back("a".into(), "3".into());
-        keeping.put_back("b".into(), "2".into());
-        assert_eq!(keeping.take().await, HashMap::from([("a".into(), "4".into()), ("b".into(), "2".into())]));
-        assert!((0..MOST_KEEPING).all(|k| keeping.put(k.to_string(), Bytes::new())));
-        assert!(!keeping.put("one more".into(), Bytes::new()) && keeping.put("7".into(), "new".into()));
-    }
 
     #[test]
     fn passwords_are_not_shown() {

@@ -79,7 +79,8 @@ fn halve(from: &[u8], size: [u32; 2], to: [u32; 2], texels: Texels) -> Vec<u8> {
     }
 }
 
-/// `mean` makes one texel of four: the upper two, then the lower two. Beyond an odd edge the last texel counts twice.
+/// `mean` makes one texel of four: the upper two, then the lower two. A side of one texel counts it twice; of another odd side the last
+/// row or column is left out.
 fn halve_by<const N: usize>(
     from: &[u8],
     [width, height]: [u32; 2],

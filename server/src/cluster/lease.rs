@@ -1,7 +1,7 @@
 //! Leases: which node is a room's home.
 
 use super::wire::{EnterAnswer, EnterQuestion, Kept, Lease};
-use super::{Cluster, GATHERING, Held, KEPT_FOR, REQUEST_TIMEOUT, lock};
+use super::{Cluster, GATHERING, Held, KEPT_FOR, PATIENT_TIMEOUT, REQUEST_TIMEOUT, lock};
 use crate::room::{RoomError, Rooms};
 use async_nats::RequestErrorKind;
 use async_nats::jetstream::kv::{CreateErrorKind, Operation, UpdateErrorKind};
@@ -191,6 +191,8 @@ impl Cluster {
         }
         let slot = &hello.slot.name;
         if let Some(kept) = kept.filter(|_| is_new || !rooms.has_kept(room, slot)) {
+            // It may be this node's own, and lost to the cluster.
+            self.fill(room, slot, &kept);
             rooms.restore(room, slot, kept);
         }
         Ok(())
@@ -217,7 +219,7 @@ impl Cluster {
         let (cluster, rooms, room, hello) = (self.clone(), rooms.clone(), room.clone(), hello.clone());
         tokio::spawn(async move {
             let kept = cluster.find_kept(&rooms, &room, &hello).await;
-            let entered = cluster.enter_now(&rooms, &room, &hello, kept).await;
+            let entered = cluster.enter(&rooms, &room, &hello, kept).await;
             let mut entering = lock(&cluster.entering);
             match entered {
                 Ok(()) => drop(entering.remove(&room)),
@@ -241,8 +243,9 @@ impl Cluster {
             self.ask_known_home(&question, room, &hello.slot.name).await?;
             return self.hold_alone(rooms, room);
         };
+        let mut tried = None;
         for _ in 0..MOST_TRIES {
-            let entry = match within(buckets.leases.entry(room.as_str())).await {
+            let entry = match self.patiently(|| buckets.leases.entry(room.as_str())).await {
                 Some(Ok(entry)) => entry,
                 // NATS has gone in this moment, or its servers are choosing one that leads them.
                 told => {
@@ -251,16 +254,22 @@ impl Cluster {
                     return self.hold_alone(rooms, room);
                 }
             };
+            // What no node has written is written over.
             let found = entry.filter(|entry| entry.operation == Operation::Put);
-            let found = found.and_then(|entry| Some((entry.revision, serde_json::from_slice::<Lease>(&entry.value).ok()?)));
-            let before = found.as_ref().map(|(_, lease)| lease.clone()).unwrap_or_default();
+            let before = found.as_ref().and_then(|entry| Lease::read(&entry.value)).unwrap_or_default();
             if !before.node.is_empty() && before.node != self.node {
                 self.ask_to_leave(&before, &question, &hello.slot.name).await?;
             }
-            let first = before.sessions.max(rooms.num_sessions(room));
-            let lease = self.own_lease(now_millis().max(before.epoch + 1), first.wrapping_add(SESSIONS_AT_ONCE));
+            // Written before, and NATS said so too late.
+            let is_written = tried.as_ref().is_some_and(|(_, lease)| *lease == before);
+            let (first, lease) = tried.take().filter(|_| is_written).unwrap_or_else(|| {
+                let first = before.sessions.max(rooms.num_sessions(room));
+                (first, self.own_lease(before.next_epoch(now_millis()), first.wrapping_add(SESSIONS_AT_ONCE)))
+            });
+            tried = Some((first, lease.clone()));
             let revision = match found {
-                Some((revision, _)) => match within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await {
+                Some(entry) if is_written => entry.revision,
+                Some(entry) => match self.patiently(|| buckets.leases.update(room.as_str(), text_of(&lease), entry.revision)).await {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => continue,
                     told => {
@@ -268,7 +277,7 @@ impl Cluster {
                         return self.hold_alone(rooms, room);
                     }
                 },
-                None => match within(buckets.leases.create(room.as_str(), text_of(&lease))).await {
+                None => match self.patiently(|| buckets.leases.create(room.as_str(), text_of(&lease))).await {
                     Some(Ok(revision)) => revision,
                     Some(Err(error)) if error.kind() == CreateErrorKind::AlreadyExists => continue,
                     told => {
@@ -289,6 +298,14 @@ impl Cluster {
         Err(LeaseError::Taken)
     }
 
+    /// NATS's answer; where it takes too long and is there for all that is known, it is asked once more and given longer.
+    async fn patiently<F: Future>(&self, ask: impl Fn() -> F) -> Option<F::Output> {
+        match within(ask()).await {
+            None if self.problem().is_none() => tokio::time::timeout(PATIENT_TIMEOUT, ask()).await.ok(),
+            answer => answer,
+        }
+    }
+
     fn own_lease(&self, epoch: u64, sessions: u32) -> Lease {
         Lease { node: self.node.clone(), address: self.address.clone(), epoch, sessions }
     }
@@ -306,8 +323,9 @@ impl Cluster {
     /// lease is void.
     async fn ask_to_leave(&self, lease: &Lease, question: &EnterQuestion, slot: &str) -> Result<(), LeaseError> {
         let start = Instant::now();
+        let mut timeout = REQUEST_TIMEOUT;
         loop {
-            match self.ask_home(lease, question).await {
+            match self.ask_home(lease, question, std::mem::replace(&mut timeout, PATIENT_TIMEOUT)).await {
                 _ if self.is_leaving.load(Ordering::SeqCst) => return Err(LeaseError::Leaving),
                 (Said::Yes, _) => return Ok(()),
                 (Said::No(answer), _) if answer.slots.iter().any(|taken| taken == slot) => return Err(LeaseError::Taken),
@@ -329,15 +347,18 @@ impl Cluster {
     }
 
     /// What a room's home says; the second value is true where NATS knows of no such node.
-    async fn ask_home(&self, lease: &Lease, question: &EnterQuestion) -> (Said, bool) {
+    async fn ask_home(&self, lease: &Lease, question: &EnterQuestion, timeout: Duration) -> (Said, bool) {
         let subject = self.subject(&format!("node.{}.enter", lease.node));
         let text = serde_json::to_vec(question).expect("plain data can be written");
-        match self.client.request(subject, text.into()).await {
-            Ok(answer) => match serde_json::from_slice::<EnterAnswer>(&answer.payload) {
-                Ok(answer) if !answer.is_granted => (Said::No(answer), false),
-                _ => (Said::Yes, false),
+        match tokio::time::timeout(timeout, self.client.request(subject, text.into())).await {
+            Ok(Ok(answer)) => match serde_json::from_slice::<EnterAnswer>(&answer.payload) {
+                Ok(answer) if answer.is_granted => (Said::Yes, false),
+                Ok(answer) => (Said::No(answer), false),
+                // Not a node's.
+                Err(_) => (Said::Nothing, false),
             },
-            Err(error) => (Said::Nothing, error.kind() == RequestErrorKind::NoResponders),
+            Ok(Err(error)) => (Said::Nothing, error.kind() == RequestErrorKind::NoResponders),
+            Err(_) => (Said::Nothing, false),
         }
     }
 
@@ -348,7 +369,7 @@ impl Cluster {
         // Another node may do the same in this moment; their sessions shall not have the same numbers.
         let at_random = std::collections::hash_map::RandomState::new().build_hasher().finish() % 10_000;
         let first = before.sessions.max(rooms.num_sessions(room)).wrapping_add(SESSIONS_AT_ONCE * (1 + at_random as u32));
-        let lease = self.own_lease(now_millis().max(before.epoch + 1), first.wrapping_add(SESSIONS_AT_ONCE));
+        let lease = self.own_lease(before.next_epoch(now_millis()), first.wrapping_add(SESSIONS_AT_ONCE));
         self.hold(rooms, room, lease, None, first)
     }
 
@@ -414,34 +435,38 @@ impl Cluster {
         if let Some(revision) = held.revision {
             let lease = Lease { sessions: rooms.num_sessions(room).wrapping_add(SESSIONS_AT_ONCE), ..held.lease };
             let renewed = within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await;
-            let mut held = lock(&self.held);
-            // Who has taken it meanwhile is heard of by the watch, too.
-            let Some(held) = held.get_mut(room).filter(|held| held.revision == Some(revision)) else { return };
-            match renewed {
-                Some(Ok(revision)) => (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now()),
-                // Its record is another, or is gone: it is claimed anew.
-                Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => held.revision = None,
-                Some(Err(error)) => tracing::debug!(%room, %error, "lease not renewed"),
-                None => tracing::debug!(%room, "lease not renewed: no answer"),
+            {
+                let mut held = lock(&self.held);
+                // Who has taken it meanwhile is heard of by the watch, too.
+                let Some(held) = held.get_mut(room).filter(|held| held.revision == Some(revision)) else { return };
+                match renewed {
+                    Some(Ok(revision)) => (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now()),
+                    // Its record is another, or is gone: it is claimed anew.
+                    Some(Err(error)) if error.kind() == UpdateErrorKind::WrongLastRevision => return held.revision = None,
+                    Some(Err(error)) => return tracing::debug!(%room, %error, "lease not renewed"),
+                    None => return tracing::debug!(%room, "lease not renewed: no answer"),
+                }
             }
+            self.keep_again(rooms, room, true);
             return;
         }
         // Opened while NATS was away, or held since before: whoever claims it first keeps it.
-        let entry = match within(buckets.leases.entry(room.as_str())).await {
+        let entry = match self.patiently(|| buckets.leases.entry(room.as_str())).await {
             Some(Ok(entry)) => entry.filter(|entry| entry.operation == Operation::Put),
             _ => return tracing::debug!(%room, "lease not looked up"),
         };
-        let other = entry.and_then(|entry| Some((entry.revision, serde_json::from_slice::<Lease>(&entry.value).ok()?)));
-        let Some((revision, other)) = other else {
+        let Some(entry) = entry else {
             if let Some(Ok(revision)) = within(buckets.leases.create(room.as_str(), text_of(&held.lease))).await {
                 self.confirm(rooms, room, held.lease, revision);
             }
             return;
         };
+        // What no node has written is written over.
+        let (revision, other) = (entry.revision, Lease::read(&entry.value).unwrap_or_default());
         let is_own = other.node == self.node;
         if !is_own && !other.node.is_empty() {
             let question = EnterQuestion { room: room.to_string(), ..EnterQuestion::default() };
-            match self.ask_home(&other, &question).await {
+            match self.ask_home(&other, &question, PATIENT_TIMEOUT).await {
                 (Said::Yes, _) => {}
                 (Said::No(_), _) => return self.lose(rooms, room, other.epoch),
                 // It may be back in a moment; this one is asked for again in the next round.
@@ -449,22 +474,28 @@ impl Cluster {
                 (Said::Nothing, _) => {}
             }
         }
-        let epoch = if is_own { held.lease.epoch.max(other.epoch) } else { held.lease.epoch.max(other.epoch + 1) };
+        let epoch = if is_own { held.lease.epoch.max(other.epoch) } else { other.next_epoch(held.lease.epoch) };
         let lease = Lease { epoch, sessions: held.lease.sessions.max(other.sessions), ..held.lease };
-        if let Some(Ok(revision)) = within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await {
+        // Written before, and NATS said so too late.
+        if other == lease {
+            self.confirm(rooms, room, lease, revision);
+        } else if let Some(Ok(revision)) = within(buckets.leases.update(room.as_str(), text_of(&lease), revision)).await {
             self.confirm(rooms, room, lease, revision);
         }
     }
 
     /// What was held alone is held before all.
     fn confirm(&self, rooms: &Rooms, room: &RoomName, lease: Lease, revision: u64) {
-        if let Some(held) = lock(&self.held).get_mut(room) {
+        {
+            let mut held = lock(&self.held);
+            let Some(held) = held.get_mut(room) else { return };
             if let Err(error) = rooms.lead(room, lease.epoch, true, 0) {
                 return tracing::warn!(%room, %error, "it is not there any more");
             }
             tracing::info!(%room, epoch = lease.epoch, "home of a room before all nodes");
             (held.lease, held.revision, held.renewed) = (lease, Some(revision), Instant::now());
         }
+        self.keep_again(rooms, room, false);
     }
 
     async fn give_back(&self, rooms: &Rooms, room: &RoomName, lease: &Lease, revision: Option<u64>) {
@@ -495,7 +526,7 @@ impl Cluster {
         let Ok(mut changes) = buckets.leases.watch_with_history(">").await else { return };
         while let Some(Ok(entry)) = changes.next().await {
             let (Some(rooms), Ok(room)) = (rooms.upgrade(), RoomName::new(&entry.key)) else { continue };
-            let lease: Option<Lease> = if entry.operation == Operation::Put { serde_json::from_slice(&entry.value).ok() } else { None };
+            let lease = if entry.operation == Operation::Put { Lease::read(&entry.value) } else { None };
             let Some(lease) = lease else {
                 lock(&self.leases).remove(&room);
                 // Not by a node: then who holds it claims it anew.

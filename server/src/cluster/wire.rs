@@ -75,6 +75,21 @@ pub(crate) struct Lease {
     pub sessions: u32,
 }
 
+impl Lease {
+    /// Reads a record; `None` where no node has written it: no clock tells of so late an epoch, and there would be none behind it.
+    pub fn read(text: &[u8]) -> Option<Self> {
+        serde_json::from_slice(text).ok().filter(|lease: &Self| lease.epoch <= LAST_EPOCH)
+    }
+
+    /// The epoch of the next home, where its clock tells `now` in milliseconds since 1970.
+    pub fn next_epoch(&self, now: u64) -> u64 {
+        now.max(self.epoch.saturating_add(1)).min(LAST_EPOCH)
+    }
+}
+
+/// Milliseconds since 1970, and some 36 million years later.
+const LAST_EPOCH: u64 = 1 << 60;
+
 /// Asks a room's home to let it go.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
@@ -134,6 +149,24 @@ pub(crate) struct NodeListing {
     pub rooms: Vec<RoomListing>,
 }
 
+/// The head of a [`NodeListing`]: whose it is.
+#[derive(Deserialize)]
+pub(crate) struct ListingHead {
+    /// Its id.
+    pub node: String,
+}
+
+impl NodeListing {
+    /// A node may have written it: nobody else's list is held.
+    pub fn is_sound(&self) -> bool {
+        self.node.len() <= MOST_NODE_BYTES && self.address.len() <= MOST_ADDRESS_BYTES && self.rooms.len() <= LISTED_AT_ONCE
+    }
+}
+
+/// Longest id of a node; nodes give themselves 16 characters.
+const MOST_NODE_BYTES: usize = 64;
+/// Longest address of a node, as of a URL that browsers take.
+const MOST_ADDRESS_BYTES: usize = 2048;
 /// Rooms that a node tells of.
 pub(crate) const MOST_LISTED: usize = 1000;
 /// Rooms in one message: NATS takes a megabyte, and a room of eight sources with long names is about 3 KB.
@@ -143,6 +176,32 @@ pub(crate) const LISTED_AT_ONCE: usize = 200;
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn lease_of_no_clock_is_not_read() {
+        let text = |epoch: u64| format!(r#"{{"node":"a","address":"b","epoch":{epoch},"sessions":1}}"#).into_bytes();
+        assert_eq!(Lease::read(&text(7)).unwrap().next_epoch(5), 8);
+        assert_eq!(Lease::read(&text(7)).unwrap().next_epoch(9), 9);
+        assert_eq!((Lease::read(&text(LAST_EPOCH + 1)), Lease::read(&text(u64::MAX)), Lease::read(b"junk")), (None, None, None));
+        let last = Lease::read(&text(LAST_EPOCH)).unwrap();
+        assert_eq!(last.next_epoch(5), LAST_EPOCH, "which others can still read");
+    }
+
+    #[test]
+    fn listing_longer_than_nodes_write_is_not_sound() {
+        let room = r#"{"name":"a","viewers":0,"session":0,"publisher":null,"sources":[],"frame":null,"neutral":null,"recording":null}"#;
+        let listing = |node: &str, num_rooms: usize| NodeListing {
+            node: node.into(),
+            address: String::new(),
+            part: 0,
+            of: 1,
+            is_partial: false,
+            rooms: vec![serde_json::from_str(room).unwrap(); num_rooms],
+        };
+        assert!(listing("a", LISTED_AT_ONCE).is_sound());
+        assert!(!listing("a", LISTED_AT_ONCE + 1).is_sound());
+        assert!(!listing(&"a".repeat(65), 1).is_sound());
+    }
 
     proptest! {
         #[test]

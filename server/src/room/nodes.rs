@@ -57,6 +57,16 @@ impl Rooms {
         self.find(name).is_some_and(|room| lock(&room.state).neutrals.contains_key(slot))
     }
 
+    /// Gives `take` what is kept of each slot of a room whose home this node is, and whether somebody has the slot. Nothing newer is
+    /// kept meanwhile.
+    pub fn each_kept(&self, name: &RoomName, mut take: impl FnMut(&str, &Kept, bool)) {
+        let Some(room) = self.find(name) else { return };
+        let state = lock(&room.state);
+        for (slot, neutral) in state.neutrals.iter().filter(|_| state.is_home) {
+            take(slot, &neutral.kept, state.publishers.iter().any(|publisher| publisher.claim.slot.name == *slot));
+        }
+    }
+
     /// Takes over what other nodes keep of a room's slot.
     pub fn restore(&self, name: &RoomName, slot: &str, kept: Kept) {
         let Ok(room) = self.find_or_make(&mut lock(&self.by_name), name) else { return };

@@ -32,6 +32,7 @@ mod linux {
     mod signal;
     #[path = "../process/socket.rs"]
     mod socket;
+    mod strangers;
     #[path = "../process/viewer.rs"]
     mod viewer;
     mod watch;
@@ -61,12 +62,16 @@ mod linux {
             trial("face_is_back_when_its_node_is_stopped_and_nothing_old_comes_when_it_goes_on", outages::stopped_node),
             trial("own_rooms_go_on_without_nats_and_all_joins_again_when_it_is_back", outages::nats_dies),
             trial("neutral_face_found_without_nats_is_kept_when_it_is_back", outages::neutral_without_nats),
+            trial("neutral_face_is_kept_again_when_nats_is_back_without_data", outages::neutral_without_data),
             trial("room_opened_at_two_nodes_without_nats_has_one_home_when_it_is_back", outages::two_homes),
             trial("node_that_starts_without_nats_takes_no_room_that_lives", outages::late_node),
             trial("node_that_ends_takes_no_room_that_it_was_asking_for", outages::leaves_while_it_asks),
             trial("publisher_that_comes_while_its_node_ends_is_told_to_come_back", outages::comes_while_it_ends),
             trial("rooms_go_on_whichever_of_three_nats_servers_dies", replicas::three_servers),
             trial("more_replicas_than_nats_servers_are_said_to_be_too_many", replicas::too_few_servers),
+            trial("what_no_node_has_written_is_not_believed", strangers::nobodys_messages),
+            trial("buckets_of_another_version_get_the_bounds_of_this_one", strangers::other_bounds),
+            trial("slow_nats_takes_no_room_from_anybody", strangers::slow_nats),
             trial("lease_that_vanishes_is_claimed_anew_by_its_home", outages::lost_lease),
             trial("rolling_restart_under_load_is_hardly_seen", outages::rolling_restart),
             trial("tracker_over_udp_holds_its_room_before_all_nodes", rooms::tracker_over_udp),

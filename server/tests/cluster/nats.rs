@@ -34,7 +34,7 @@ impl Nats {
         Self::at(free_port(), Arc::new(tempfile::tempdir().unwrap()), more)
     }
 
-    fn at(port: u16, folder: Arc<tempfile::TempDir>, more: Vec<String>) -> Self {
+    pub fn at(port: u16, folder: Arc<tempfile::TempDir>, more: Vec<String>) -> Self {
         let address = more.iter().skip_while(|word| *word != "-a").nth(1).map_or("127.0.0.1", String::as_str).to_owned();
         let mut command = nats_server();
         command.args(["-js", "-p", &port.to_string(), "-sd"]).arg(folder.path());

@@ -1,8 +1,9 @@
-//! NATS servers that stand in for each other.
+//! Several `nats-server`s that are one cluster.
 
 use super::http;
 use super::nats::{Nats, free_port};
 use serde_json::Value;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// NATS servers that are one cluster.
@@ -32,7 +33,7 @@ impl NatsCluster {
 
     pub fn start_another(&mut self) {
         let more = self.more[self.servers.len()].clone();
-        self.servers.push(Nats::with(&more.iter().map(String::as_str).collect::<Vec<_>>()));
+        self.servers.push(Nats::at(free_port(), Arc::new(tempfile::tempdir().unwrap()), more));
     }
 
     /// All addresses, of which a client takes any.

@@ -160,6 +160,40 @@ pub fn neutral_without_nats() {
     assert_eq!(ready["kept_neutral"], true, "{ready}, after {before}");
 }
 
+/// NATS comes back without its data, and later the node is lost.
+pub fn neutral_without_data() {
+    let mut nats = Nats::start();
+    let url = nats.url();
+    let (mut a, b) = (Node::start(&url).ready(), Node::start(&url).ready());
+    let feed = write_feed(nats.folder.path(), 60);
+    let folder = nats.folder.clone();
+    let sender = send(&feed, &[&a.address], "demo", &folder.path().join("send.log"));
+    let before = wait_for("a neutral", || neutral(&a, "demo"));
+    // What comes later would be kept without this.
+    wait_for("the settings", || {
+        // So many may be asked for.
+        std::thread::sleep(Duration::from_millis(100));
+        (settings(&a, "demo")["gains"]["mouth"] == 0.75).then_some(())
+    });
+    std::thread::sleep(Duration::from_millis(300));
+    nats.kill();
+    for node in [&a, &b] {
+        wait_for("the health to tell it", || node.get("/healthz").unwrap().starts_with("degraded").then_some(()));
+    }
+    nats.folder = Arc::new(tempfile::tempdir().unwrap());
+    nats.restart();
+    for node in [&a, &b] {
+        wait_for("all to join again", || (node.get("/healthz").unwrap() == "ok\n").then_some(()));
+    }
+    // Two rounds, in which the room is claimed and what it keeps is kept again.
+    std::thread::sleep(Duration::from_millis(1500));
+    a.kill();
+    drop(sender);
+    let mut again = b.publisher("demo", &HELLO.replace("\"fps\"", "\"takeover\":true,\"keep_neutral\":true,\"fps\""));
+    let ready = again.answer();
+    assert_eq!(ready["kept_neutral"], true, "{ready}, after {before}");
+}
+
 /// Two nodes open one room while NATS is away; the viewer at a third one sees the one that keeps it, and never the other.
 pub fn two_homes() {
     let mut cluster = Cluster::start();
