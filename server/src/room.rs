@@ -651,7 +651,7 @@ mod tests {
     #[test]
     fn era_begins_where_sessions_go_back_and_not_where_numbers_wrap() {
         let mut eras = Eras::default();
-        let states = [(1, 0), (1, 7), (3, 0), (u32::MAX / 2, 9), (u32::MAX, 5), (0, 0), (4, u32::MAX), (4, 0)];
+        let states = [(1, 0), (1, 7), (3, 0), (1 << 30, 9), (1 << 31, 0), (3 << 30, 5), (u32::MAX, 5), (0, 0), (4, u32::MAX), (4, 0)];
         assert!(states.iter().all(|&(session, seq)| eras.of(session, seq) == 0), "all go on");
         assert_eq!((eras.of(3, 100), eras.of(3, 101), eras.of(3, 50), eras.of(4, 0)), (1, 1, 2, 2));
     }
