@@ -155,7 +155,12 @@ pub fn neutral_without_nats() {
     std::thread::sleep(Duration::from_millis(1500));
     a.kill();
     drop(sender);
-    let mut again = b.publisher("demo", &HELLO.replace("\"fps\"", "\"takeover\":true,\"keep_neutral\":true,\"fps\""));
+    assert_neutral_is_kept(&b, &before);
+}
+
+/// A node has the neutral face that its lost home came to `before`.
+fn assert_neutral_is_kept(node: &Node, before: &Value) {
+    let mut again = node.publisher("demo", &HELLO.replace("\"fps\"", "\"takeover\":true,\"keep_neutral\":true,\"fps\""));
     let ready = again.answer();
     assert_eq!(ready["kept_neutral"], true, "{ready}, after {before}");
 }
@@ -189,9 +194,7 @@ pub fn neutral_without_data() {
     std::thread::sleep(Duration::from_millis(1500));
     a.kill();
     drop(sender);
-    let mut again = b.publisher("demo", &HELLO.replace("\"fps\"", "\"takeover\":true,\"keep_neutral\":true,\"fps\""));
-    let ready = again.answer();
-    assert_eq!(ready["kept_neutral"], true, "{ready}, after {before}");
+    assert_neutral_is_kept(&b, &before);
 }
 
 /// Two nodes open one room while NATS is away; the viewer at a third one sees the one that keeps it, and never the other.
